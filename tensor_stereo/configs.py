@@ -1,0 +1,96 @@
+"""Settings of every step, as frozen dataclasses with units in the field names. Imports no torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Detector = Literal["sift", "fast", "surf", "gftt"]
+Restriction = Literal["adjacency", "cardinality"]
+Backend = Literal["auto", "native", "scipy"]
+
+DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4
+
+
+@dataclass(frozen=True)
+class SIFTConfig:
+    """Scale-invariant feature transform (Lowe 2004): sub-pixel keypoints, 128-vectors."""
+
+    backend: Literal["kornia", "opencv"] = "kornia"
+    max_keypoints: int = 2000
+
+
+@dataclass(frozen=True)
+class FASTConfig:
+    """Features from accelerated segment test (Rosten & Drummond 2006), OpenCV's detector, with image windows."""
+
+    threshold: int = 20  # grey levels by which the arc must differ from the centre
+    nonmax_suppression: bool = True
+    max_keypoints: int = 2000  # the strongest are kept
+    window_px: int = 11  # side of the square window that SSD compares, odd
+
+
+@dataclass(frozen=True)
+class SURFConfig:
+    """Speeded-up robust features (Bay et al. 2006), mahotas' implementation, 64-vectors."""
+
+    num_octaves: int = 4
+    num_scales: int = 6
+    initial_step_px: int = 1
+    threshold: float = 0.1  # on the determinant of the Hessian, in mahotas' scale
+    max_keypoints: int = 2000
+
+
+@dataclass(frozen=True)
+class GFTTConfig:
+    """Good features to track (Shi & Tomasi 1994), with image windows."""
+
+    backend: Literal["kornia", "opencv"] = "kornia"
+    quality_level: float = 0.01  # fraction of the image's strongest response
+    min_distance_px: int = 3
+    max_keypoints: int = 1000
+    window_px: int = 11  # side of the square window that SSD compares, odd
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """Nearest neighbour by sum of squared differences, one-to-one by lowest cost. ``None`` switches a gate off."""
+
+    max_ratio: float | None = None  # best / second-best distance (Lowe 2004); None: SIFT 0.8, others no test
+    mutual: bool = False  # keep only pairs that are each other's nearest neighbour
+    max_row_offset_px: float | None = None  # |y0 - y1|
+    min_disparity_px: float | None = None  # x0 - x1
+    max_disparity_px: float | None = None
+
+
+@dataclass(frozen=True)
+class ObjectsConfig:
+    """Object contours of Restriction 3 (the paper, section 3)."""
+
+    element_px: int = 5  # side of the square structuring element, odd
+    min_area_px: float = 50.0  # area that a contour must enclose
+
+
+@dataclass(frozen=True)
+class ClassifyConfig:
+    """The set test on the two Delaunay graphs (the paper, section 3)."""
+
+    restriction: Restriction = "cardinality"
+    min_group_size: int = 4
+    tie_tolerance: float = 1e-3  # in edge lengths
+    backend: Backend = "auto"
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """From two images to verdicts."""
+
+    detector: Detector = "fast"
+    constrained: bool = False  # Restriction 3: split the matches by object first
+    sift: SIFTConfig = field(default_factory=SIFTConfig)
+    fast: FASTConfig = field(default_factory=FASTConfig)
+    surf: SURFConfig = field(default_factory=SURFConfig)
+    gftt: GFTTConfig = field(default_factory=GFTTConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    classify: ClassifyConfig = field(default_factory=ClassifyConfig)

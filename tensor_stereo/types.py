@@ -1,7 +1,7 @@
 """The ragged batch forms that every step exchanges.
 
-B pairs (or images) are concatenated along the first axis; ``ptr`` (B + 1,) int64 holds their offsets, so that pair ``b``
-owns the rows ``ptr[b]:ptr[b + 1]``. Coordinates are (x, y) in pixels, pixel centres at integers.
+B pairs (or images) are concatenated along the first axis; ``ptr`` (B + 1,) int64 holds their offsets, so that pair
+``b`` owns the rows ``ptr[b]:ptr[b + 1]``. Coordinates are (x, y) in pixels, pixel centres at integers.
 """
 
 from __future__ import annotations

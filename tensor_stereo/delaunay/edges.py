@@ -1,0 +1,134 @@
+"""Edges of the exact Delaunay graph of every segment of a ragged batch.
+
+Qhull proposes a triangulation; exact predicates certify it; what they refuse is built anew in integer arithmetic.
+An edge of the triangulation belongs to the graph iff its opposite vertices are not co-circular with it, and, with a
+tolerance e, iff its dual Voronoi edge, clipped to 1 / e edge lengths around the midpoint, exceeds e edge lengths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay, QhullError
+
+from tensor_stereo.delaunay.divide import divide_and_conquer
+from tensor_stereo.delaunay.mesh import HULL, Int, Mesh, build_mesh
+from tensor_stereo.delaunay.predicates import Float
+
+
+def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads: int) -> Int:
+    """Edges of the Delaunay graph of every segment.
+
+    Args:
+        points: (N, 2) float64, distinct within a segment, 0 or 1e-60..1e60 in magnitude.
+        ptr: (S + 1,) int64 offsets of the segments.
+        tie_tolerance: e of the module's docstring, in edge lengths; 0 gives the exact strict graph.
+        num_threads: threads that run Qhull.
+
+    Returns:
+        (E, 2) int64 pairs of global point indices, each edge once, in no particular order.
+
+    Example:
+        >>> import numpy as np
+        >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        >>> edges = delaunay_edges(square, np.array([0, 4]), tie_tolerance=0.0, num_threads=1)
+        >>> sorted(map(tuple, np.sort(edges, axis=1).tolist()))  # no diagonal
+        [(0, 1), (0, 3), (1, 2), (2, 3)]
+    """
+    size = np.diff(ptr)
+    segments = np.flatnonzero(size > 2)
+    parts = [points[ptr[s] : ptr[s + 1]] for s in segments]
+    if num_threads > 1 and len(parts) > 1:
+        with ThreadPoolExecutor(num_threads) as pool:
+            proposals = list(pool.map(_qhull, parts))
+    else:
+        proposals = [_qhull(part) for part in parts]
+    edges, faulty = _certified_edges(points, ptr, proposals, segments, tie_tolerance)
+    found = [edges, ptr[:-1][size == 2][:, None] + np.array([0, 1])]
+    if len(faulty):
+        rebuilt = [divide_and_conquer(points[ptr[s] : ptr[s + 1]]) for s in faulty]
+        flat = np.array([len(triangles) == 0 for triangles in rebuilt])
+        edges, wrong = _certified_edges(points, ptr, [t for t in rebuilt if len(t)], faulty[~flat], tie_tolerance)
+        if len(wrong):
+            raise RuntimeError(f"the exact triangulation of segments {wrong[:10].tolist()} fails its own proof")
+        found += [edges, *(_path(points, ptr, s) for s in faulty[flat])]
+    return np.concatenate(found)
+
+
+def _qhull(points: Float) -> Int:
+    centre = (points.min(0) + points.max(0)) / 2  # Qhull's tolerance grows with the distance from the origin
+    try:
+        simplices: Int = Delaunay(points - centre).simplices.astype(np.int64)
+    except QhullError:  # collinear, or flat by its tolerance
+        return np.empty((0, 3), dtype=np.int64)
+    return simplices
+
+
+def _path(points: Float, ptr: Int, segment: np.int64) -> Int:
+    """Edges of a collinear segment: a path in lexicographic order."""
+    part = points[ptr[segment] : ptr[segment + 1]]
+    order = np.lexsort((part[:, 1], part[:, 0])) + ptr[segment]
+    return np.stack([order[:-1], order[1:]], 1)
+
+
+def _certified_edges(
+    points: Float, ptr: Int, triangulations: Sequence[Int], segments: Int, tie_tolerance: float
+) -> tuple[Int, Int]:
+    """Graph edges of the segments whose triangulation is the Delaunay triangulation, and the other segments."""
+    empty = np.empty((0, 3), dtype=np.int64)
+    triangles = np.concatenate([empty, *(t + ptr[s] for t, s in zip(triangulations, segments, strict=True))])
+    mesh, faulty = build_mesh(points, ptr, triangles, segments)
+    kept = mesh.side < 0
+    if tie_tolerance > 0:
+        kept &= _dual_length(points, mesh, 1 / tie_tolerance) > tie_tolerance
+    if len(faulty):
+        kept &= ~np.isin(np.searchsorted(ptr, mesh.edges[:, 0], side="right") - 1, faulty)
+    return mesh.edges[kept], faulty
+
+
+def _dual_length(points: Float, mesh: Mesh, bound: float) -> Float:
+    """(E,) length of the dual Voronoi edges in edge lengths, each end clipped to ``bound`` from the midpoint.
+
+    In edge lengths, the centre of the circle through i, j and k lies cot(angle at k) / 2 from the midpoint of {i, j}.
+    """
+    opposite = _canonical_opposite(points, mesh)
+    ends = []
+    for k in opposite.T:
+        v, w = points[mesh.edges[:, 0]] - points[k], points[mesh.edges[:, 1]] - points[k]
+        dot = v[:, 0] * w[:, 0] + v[:, 1] * w[:, 1]
+        cross = np.abs(v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0])  # its sign is known, its rounding must not flip it
+        with np.errstate(divide="ignore", invalid="ignore"):
+            end = np.clip(0.5 * dot / cross, -bound, bound)
+        ends.append(np.where(k == HULL, bound, end))
+    return ends[0] + ends[1]
+
+
+def _canonical_opposite(points: Float, mesh: Mesh) -> Int:
+    """Opposite vertices that depend on the points alone.
+
+    The triangulation of a co-circular polygon is arbitrary, and its vertices give the same circle but for rounding:
+    take the polygon's lexicographically first vertex that is not on the edge.
+    """
+    tied = mesh.side == 0
+    if not tied.any():
+        return mesh.opposite
+    num_triangles = len(mesh.triangles)
+    a, b = mesh.triangle[tied].T
+    graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(num_triangles, num_triangles))
+    polygon = connected_components(graph, directed=False)[1]  # (T,)
+
+    several = np.unique([a, b])  # triangles that share a polygon with another one
+    member, vertex = np.repeat(polygon[several], 3), mesh.triangles[several].reshape(-1)
+    order = np.lexsort((points[vertex, 1], points[vertex, 0], member))
+    member, vertex = member[order], vertex[order]
+    distinct = (np.diff(member, prepend=-1) != 0) | (np.diff(vertex, prepend=-1) != 0)
+    member, vertex = member[distinct], vertex[distinct]
+    first = np.searchsorted(member, polygon[mesh.triangle]) + np.arange(3)[:, None, None]  # (3, E, 2)
+    candidate = vertex[np.minimum(first, len(vertex) - 1)]
+    free = (candidate != mesh.edges[:, :1]) & (candidate != mesh.edges[:, 1:])
+    chosen = np.take_along_axis(candidate, free.argmax(0)[None], 0)[0]
+    return np.where(np.isin(mesh.triangle, several), chosen, mesh.opposite)

@@ -8,7 +8,7 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from tensor_stereo.types import Matches, check_ptr, check_rows
+from tensor_stereo.types import Features, Matches, check_ptr, check_rows
 
 
 def lengths_to_ptr(lengths: Tensor) -> Tensor:
@@ -170,4 +170,20 @@ def select_matches(matches: Matches, mask: Tensor) -> Matches:
         ptr=kept[matches.ptr],
         cost=None if matches.cost is None else matches.cost[mask],
         group=None if matches.group is None else matches.group[mask],
+    )
+
+
+def concatenate_features(items: Sequence[Features]) -> Features:
+    """Join the images of several feature batches into one batch.
+
+    Raises:
+        ValueError: for an empty sequence, which has no descriptor length.
+    """
+    if not items:
+        raise ValueError("items must hold at least one Features, got an empty sequence")
+    return Features(
+        keypoints=torch.cat([item.keypoints for item in items]),
+        ptr=lengths_to_ptr(torch.cat([item.ptr.diff() for item in items])),
+        descriptors=torch.cat([item.descriptors for item in items]),
+        scores=torch.cat([item.scores for item in items]),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
@@ -18,6 +18,8 @@ class SIFTConfig:
 
     backend: Literal["kornia", "opencv"] = "kornia"
     max_keypoints: int = 2000
+    upright: bool = False  # no orientation: more matches between rectified views, a little fewer of them correct
+    max_ratio: float | None = 0.8  # best / second-best distance; Lowe 2004; None: no test
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class GFTTConfig:
 class MatchingConfig:
     """Nearest neighbour by sum of squared differences, one-to-one by lowest cost. ``None`` switches a gate off."""
 
-    max_ratio: float | None = None  # best / second-best distance (Lowe 2004); None: SIFT 0.8, others no test
+    max_ratio: float | None = None  # best / second-best distance; None: what the detector's own settings say
     mutual: bool = False  # keep only pairs that are each other's nearest neighbour
     max_row_offset_px: float | None = None  # |y0 - y1|
     min_disparity_px: float | None = None  # x0 - x1
@@ -76,21 +78,40 @@ class ClassifyConfig:
     """The set test on the two Delaunay graphs (the paper, section 3)."""
 
     restriction: Restriction = "cardinality"
-    min_group_size: int = 4
+    min_group_size: int = 4  # distinct matches below which a group says nothing
     tie_tolerance: float = 1e-3  # in edge lengths
     backend: Backend = "auto"
 
 
 @dataclass(frozen=True)
-class PipelineConfig:
-    """From two images to verdicts."""
+class StepConfigs(ClassifyConfig):
+    """Settings of all steps, whichever detector runs."""
 
-    detector: Detector = "fast"
-    constrained: bool = False  # Restriction 3: split the matches by object first
     sift: SIFTConfig = field(default_factory=SIFTConfig)
     fast: FASTConfig = field(default_factory=FASTConfig)
     surf: SURFConfig = field(default_factory=SURFConfig)
     gftt: GFTTConfig = field(default_factory=GFTTConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    classify: ClassifyConfig = field(default_factory=ClassifyConfig)
+
+
+@dataclass(frozen=True)
+class PipelineConfig(StepConfigs):
+    """From two images to verdicts."""
+
+    detector: Detector = "fast"
+    constrained: bool = False  # Restriction 3: split the matches by object first
+
+
+@dataclass(frozen=True)
+class EvaluationConfig(StepConfigs):
+    """From pairs with ground truth to the paper's tables; ``restriction`` is the one that the tables show."""
+
+    min_group_size: int = 1  # 1: the paper read literally
+    detectors: tuple[Detector, ...] = DETECTORS
+    max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more
+
+    def pipeline(self, detector: Detector, *, constrained: bool = False) -> PipelineConfig:
+        """The same settings for one detector."""
+        shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)}
+        return PipelineConfig(**shared, detector=detector, constrained=constrained)

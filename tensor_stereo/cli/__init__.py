@@ -1,0 +1,38 @@
+"""The command ``tensor-stereo``: parse, call the library, print."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Classify, tyro.conf.subcommand("classify")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line; bad input ends in one line on standard error and exit code 2."""
+    command: Any = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="tensor-stereo",
+        description="Decide which putative stereo matches are right.",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
+    from tensor_stereo.cli.runners import run  # torch is needed from here on
+
+    try:
+        run(command)
+    except (ValueError, TypeError, OSError) as error:
+        print(f"tensor-stereo: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("tensor-stereo: interrupted", file=sys.stderr)
+        sys.exit(130)

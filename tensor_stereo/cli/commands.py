@@ -1,0 +1,61 @@
+"""What each subcommand takes. Imports no torch, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from tensor_stereo.configs import EvaluationConfig, PipelineConfig
+
+Flat = tyro.conf.arg(name="")
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Classify the embedded synthetic set with all detectors and print the paper's tables for it."""
+
+    num_pairs: int = 4
+    """Pairs to render."""
+    seed: int = 0
+    """Seed of the rendered scenes."""
+    out: Path | None = None
+    """Folder for summary.json, settings.json, the tables and one figure per scene and detector."""
+
+
+@dataclass(frozen=True)
+class Classify:
+    """Match one rectified pair and decide which matches are right."""
+
+    left: tyro.conf.Positional[Path]
+    """Image of view 0."""
+    right: tyro.conf.Positional[Path]
+    """Image of view 1."""
+    disparity_gt: Path | None = None
+    """Ground-truth disparity of view 0: PFM, 8-bit or 16-bit PNG."""
+    gt_scale: float | None = None
+    """Stored value / px of disparity in a PNG map."""
+    out: Path | None = None
+    """Table of matches and verdicts, .csv or .parquet."""
+    figure: Path | None = None
+    """PNG of both views, their matches and graphs."""
+    config: Annotated[PipelineConfig, Flat] = field(default_factory=PipelineConfig)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Classify every pair below a folder and print the paper's five tables."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder with one or several stereo releases."""
+    scenes: tuple[str, ...] | None = None
+    """Scenes to evaluate, in any case; all if not given."""
+    preset: Literal["default", "paper"] = "default"
+    """paper: SIFT with ratio 0.6, as in Lowe's demo program."""
+    gt_scale: float | None = None
+    """Stored value / px of disparity, where the folder layout does not tell it."""
+    out: Path | None = None
+    """Folder for summary.json, settings.json, the tables and one figure per scene and detector."""
+    config: Annotated[EvaluationConfig, Flat] = field(default_factory=EvaluationConfig)

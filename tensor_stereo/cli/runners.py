@@ -1,0 +1,5 @@
+import sys
+
+
+def run(c):
+    print(c)

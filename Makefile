@@ -38,7 +38,7 @@ types: $(READY)  ## Check the types
 	$(BIN)/mypy
 
 imports: $(READY)  ## Check the import rules of the package
-	$(BIN)/lint-imports
+	$(BIN)/lint-imports --no-logo --no-cache
 
 slow: $(READY)  ## Run the tests marked slow, cluster, browser or notebook
 	$(BIN)/python -m pytest -m 'slow or cluster or browser or notebook'

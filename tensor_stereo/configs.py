@@ -115,3 +115,28 @@ class EvaluationConfig(StepConfigs):
         """The same settings for one detector."""
         shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)}
         return PipelineConfig(**shared, detector=detector, constrained=constrained)
+
+
+@dataclass(frozen=True)
+class SyntheticConfig:
+    """Size and difficulty of the rendered pairs."""
+
+    width_px: int = 400
+    height_px: int = 300
+    min_disparity_px: float = 6.0  # of the background, roughly
+    max_disparity_px: float = 60.0  # of the nearest surface, roughly
+    num_poles: int = 4
+    noise_levels: float = 2.0  # standard deviation of the sensor noise, in grey levels, independent in both views
+    gain: float = 0.97  # of view 1
+    offset_levels: float = 2.0  # of view 1
+    samples_per_px: int = 2  # along each axis
+
+    def __post_init__(self) -> None:
+        for name in ("width_px", "height_px", "samples_per_px"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.min_disparity_px < self.max_disparity_px:
+            limits = f"{self.min_disparity_px} and {self.max_disparity_px}"
+            raise ValueError(f"min_disparity_px must lie between 0 and max_disparity_px, got {limits}")
+        if self.noise_levels < 0:
+            raise ValueError(f"noise_levels must not be negative, got {self.noise_levels}")

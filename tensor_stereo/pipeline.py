@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features
@@ -109,12 +108,12 @@ def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwa
     Images run one by one: not every detector is bit-equal in a batch, and none is faster in one.
     """
     with watch.measure("detect"):
-        views = [detect_views([pair[view] for pair in gray], config) for view in (0, 1)]
+        features0, features1 = (detect_views([pair[view] for pair in gray], config) for view in (0, 1))
     with watch.measure("match"):
         matching = config.matching
         if matching.max_ratio is None and config.detector == "sift":
             matching = replace(matching, max_ratio=config.sift.max_ratio)
-        return match_features(*views, matching)
+        return match_features(features0, features1, matching)
 
 
 def detect_views(images: Sequence[Tensor], config: PipelineConfig) -> Features:

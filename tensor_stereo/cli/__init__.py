@@ -20,7 +20,7 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; bad input ends in one line on standard error and exit code 2."""
     command: Any = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         prog="tensor-stereo",
         description="Decide which putative stereo matches are right.",
         args=arguments,

@@ -1,0 +1,51 @@
+"""Readers of published stereo pairs with ground truth. Names load on first use, so that the import stays cheap."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .calibration import Calibration as Calibration
+    from .calibration import read_calibration as read_calibration
+    from .discovery import find_pairs as find_pairs
+    from .eth3d import find_eth3d as find_eth3d
+    from .files import PairFiles as PairFiles
+    from .images import read_disparity_png as read_disparity_png
+    from .images import read_image as read_image
+    from .images import read_occlusion_mask as read_occlusion_mask
+    from .kitti import find_kitti as find_kitti
+    from .middlebury import find_middlebury as find_middlebury
+    from .pairs import PairDataset as PairDataset
+    from .pairs import read_pair as read_pair
+    from .pfm import read_pfm as read_pfm
+    from .pfm import write_pfm as write_pfm
+
+_MODULES = {
+    "Calibration": "calibration",
+    "PairDataset": "pairs",
+    "PairFiles": "files",
+    "find_eth3d": "eth3d",
+    "find_kitti": "kitti",
+    "find_middlebury": "middlebury",
+    "find_pairs": "discovery",
+    "read_calibration": "calibration",
+    "read_disparity_png": "images",
+    "read_image": "images",
+    "read_occlusion_mask": "images",
+    "read_pair": "pairs",
+    "read_pfm": "pfm",
+    "write_pfm": "pfm",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

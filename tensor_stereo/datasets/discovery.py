@@ -1,0 +1,99 @@
+"""All pairs below one folder, whatever the release. Imports no torch."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from .eth3d import eth3d_pairs
+from .files import PairFiles, StrPath, check_gt_scale, collect_pairs, missing_scale
+from .kitti import kitti_pairs
+from .middlebury import middlebury_pairs
+
+_EXPECTED = """\
+  Middlebury 2001, 2003:     SCENE/im2, im6, disp2 (png, ppm or pgm)
+  Middlebury 2005, 2006:     SCENE/view1, view5, disp1 (png)
+  Middlebury 2014, 2021:     SCENE/im0.png, im1.png, disp0.pfm
+  MiddEval3, ETH3D two-view: SCENE/im0.png, im1.png, disp0GT.pfm
+  KITTI 2012:                training/colored_0, colored_1 (or image_0, image_1), disp_occ/*_10.png
+  KITTI 2015:                training/image_2, image_3, disp_occ_0/*_10.png"""
+
+
+def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: float | None = None) -> list[PairFiles]:
+    """Find the stereo pairs of every known release in ``root`` and below.
+
+    Pairs of one dataset and scene (a release in several sizes) are told apart by the folder that holds the scene, which
+    is appended to their dataset: ``middeval3:trainingQ`` and ``middeval3:trainingH``.
+
+    Args:
+        root: a folder with several releases, one release, a folder of scenes, or one scene's folder.
+        scenes: names to select, without regard to case: ``cones``, or ``middlebury-2003/cones`` where several releases
+            have a scene of that name; a bare name selects all of them. None takes every pair.
+        gt_scale: stored value / gt_scale = disparity in px, for the 8-bit maps of Middlebury 2001-2006. It replaces the
+            scale that release and size tell; maps whose format fixes the scale (PFM, KITTI) keep theirs.
+
+    Returns:
+        Pairs sorted by (dataset, scene without case, path).
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: if ``root`` is no folder.
+        TypeError: if ``scenes`` is one string.
+        ValueError: if no pair is found (lists what was looked for), a scene is missing (lists those found), ``scenes``
+            is empty, ``gt_scale`` is not positive, a scene is incomplete, or the scale of a selected map is open and
+            ``gt_scale`` is None (the message asks for ``--gt-scale``).
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as root:
+    ...     for scene in ("Art", "my_scene"):
+    ...         Path(root, scene).mkdir()
+    ...         for name in ("view1.ppm", "view5.ppm", "disp1.pgm"):
+    ...             _ = Path(root, scene, name).write_bytes(b"P6 64 48 255 ")
+    ...     [(pair.dataset, pair.scene, pair.gt_scale) for pair in find_pairs(root, scenes=["art"])]
+    [('middlebury-2005', 'Art', 3.0)]
+    """
+    check_gt_scale(gt_scale)
+    pairs = collect_pairs(root, [middlebury_pairs, kitti_pairs, eth3d_pairs])
+    if not pairs:
+        raise ValueError(f"no stereo pairs in {root} or below; looked for these layouts:\n{_EXPECTED}")
+    pairs = _tell_apart(pairs, Path(root))
+    if scenes is not None:
+        pairs = _select(pairs, scenes)
+    if gt_scale is not None:
+        return [replace(pair, gt_scale=gt_scale) if _has_release_scale(pair) else pair for pair in pairs]
+    for pair in pairs:
+        if pair.disparity_gt is not None and pair.gt_scale is None:
+            raise missing_scale(pair)
+    return pairs
+
+
+def _tell_apart(pairs: Sequence[PairFiles], root: Path) -> list[PairFiles]:
+    """Append the folder above the scene to the dataset of pairs that share dataset and scene."""
+    counts = Counter((pair.dataset, pair.scene) for pair in pairs)
+    told = []
+    for pair in pairs:
+        if counts[pair.dataset, pair.scene] > 1:
+            folder = pair.image0.parent.parent.relative_to(root).as_posix()
+            pair = replace(pair, dataset=f"{pair.dataset}:{folder}")
+        told.append(pair)
+    return sorted(told, key=lambda pair: (pair.dataset, pair.scene.casefold()))
+
+
+def _select(pairs: Sequence[PairFiles], scenes: Iterable[str]) -> list[PairFiles]:
+    if isinstance(scenes, str):
+        raise TypeError(f"scenes must be a sequence of names, got the string {scenes!r}")
+    wanted = {name.casefold(): name for name in scenes}
+    if not wanted:
+        raise ValueError("scenes must name at least one scene, or be None for all")
+    names = [{pair.scene.casefold(), f"{pair.dataset}/{pair.scene}".casefold()} for pair in pairs]
+    missing = [name for key, name in wanted.items() if not any(key in own for own in names)]
+    if missing:
+        found = ", ".join(sorted({pair.scene for pair in pairs}, key=str.casefold))
+        raise ValueError(f"scenes not found: {', '.join(missing)}; found: {found}")
+    return [pair for pair, own in zip(pairs, names, strict=True) if not own.isdisjoint(wanted)]
+
+
+def _has_release_scale(pair: PairFiles) -> bool:
+    is_map = pair.disparity_gt is not None and pair.disparity_gt.suffix != ".pfm"
+    return is_map and not pair.dataset.startswith("kitti")

@@ -1,0 +1,138 @@
+"""Middlebury's two-view releases: 2001, 2003, 2005, 2006, 2014, 2021 and the third evaluation (MiddEval3).
+
+Sources: Scharstein & Szeliski 2002 (2001), Scharstein & Szeliski 2003, Scharstein & Pal 2007 (2005), Hirschmueller &
+Scharstein 2007 (2006), Scharstein et al. 2014, and the pages of the releases, https://vision.middlebury.edu/stereo/data/.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from .eth3d import is_eth3d_scene
+from .files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
+from .image_size import image_size
+from .middlebury_scales import find_release, folder_year, integer_scale
+
+_MIDDEVAL3 = re.compile(r"middeval3|(?:training|test)[FHQ]", re.IGNORECASE)
+_SCENES_2014 = re.compile(r".+-(?:im)?perfect", re.IGNORECASE)
+_SCENES_2021 = re.compile(
+    r"(?:artroom|bandsaw|chess|curule|ladder|octogons|pendulum|podium|skates|skiboots|traproom)\d", re.IGNORECASE
+)
+
+
+class _Layout(NamedTuple):
+    image0: Sequence[str]
+    image1: Sequence[str]
+    disparity_gt: Sequence[str]
+    years: Sequence[str]  # releases that used these names for integer maps, none for float maps
+
+
+def _integer_layout(image0: str, image1: str, disparity_gt: str, years: Sequence[str]) -> _Layout:
+    names0, names1, names_gt = (
+        [stem + end for end in (".png", ".ppm", ".pgm")] for stem in (image0, image1, disparity_gt)
+    )
+    return _Layout(names0, names1, names_gt, years)
+
+
+_LAYOUTS = (
+    _Layout(["im0.png"], ["im1.png"], ["disp0GT.pfm", "disp0.pfm"], ()),
+    _integer_layout("view1", "view5", "disp1", ("2005", "2006")),
+    _integer_layout("im2", "im6", "disp2", ("2001", "2003")),  # before im0, im1: archives of nine views hold im0 to im8
+    _integer_layout("scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", ("2001",)),  # tsukuba
+    _integer_layout("im0", "im1", "disp0", ("2001",)),  # map
+)
+
+
+def find_middlebury(root: StrPath) -> list[PairFiles]:
+    """Find Middlebury's pairs in ``root`` and below; no image is decoded.
+
+    ======================  ==================================  ===============================================
+    release                 files of a scene                    disparity map
+    ======================  ==================================  ===============================================
+    2001                    im2, im6, disp2 (map: im0, im1,     8 bits, scale 8, tsukuba 16
+                            disp0; tsukuba: scene1.row3.col3,
+                            col4, truedisp.row3.col3)
+    2003                    im2, im6, disp2                     8 bits, scale 4, 2 or 1 in quarter, half or full size
+    2005, 2006              view1, view5, disp1                 8 bits, scale 3, 2 or 1 in third, half or full size
+    2014, 2021              im0, im1, disp0.pfm, calib.txt      PFM in px
+    MiddEval3               im0, im1, disp0GT.pfm, calib.txt,   PFM in px
+                            mask0nocc.png
+    ======================  ==================================  ===============================================
+
+    Images and 8-bit maps may be PNG, PPM or PGM. For 2001-2006 ``gt_scale`` is settled by the release (a folder above
+    the scene named for it, as ``2003``, ``scenes2005`` or ``middlebury-2006``, else the scene's name) and the size (a
+    folder as ``HalfSize``, a name as ``conesH``, else the width of view 0); it is None where these leave it open or
+    disagree. Scenes without a disparity map are listed with ``disparity_gt=None``.
+
+    Args:
+        root: a folder with releases, one release, or one scene's folder.
+
+    Returns:
+        Pairs sorted by (dataset, scene, path); empty if there is none.
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: if ``root`` is no folder.
+        ValueError: if a scene lacks one view beside its disparity map, or a view has no readable header.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as root:
+    ...     scene = Path(root, "2003", "cones")
+    ...     scene.mkdir(parents=True)
+    ...     for name in ("im2.ppm", "im6.ppm", "disp2.pgm"):
+    ...         _ = (scene / name).write_bytes(b"P6 450 375 255 ")
+    ...     [pair] = find_middlebury(root)
+    >>> pair.dataset, pair.scene, pair.gt_scale
+    ('middlebury-2003', 'cones', 4.0)
+    """
+    return collect_pairs(root, [middlebury_pairs])
+
+
+def middlebury_pairs(folder: Path) -> list[PairFiles]:
+    """Return the Middlebury pair directly in ``folder``, as a list of none or one.
+
+    >>> middlebury_pairs(Path("no/such/folder"))
+    []
+    """
+    present = [(layout, views) for layout in _LAYOUTS if (views := find_views(folder, *layout[:3])) is not None]
+    if not present:
+        return []
+    layout, views = next(((layout, views) for layout, views in present if views.disparity_gt is not None), present[0])
+    scene = parent_names(folder)[0]
+    if layout.years:
+        release = find_release(folder, years=layout.years)
+        dataset = "middlebury" if release is None else f"middlebury-{release}"
+        scale = None
+        if views.disparity_gt is not None:
+            width, _ = image_size(views.image0)
+            scale = integer_scale(folder, width=width, years=layout.years)
+        return [PairFiles(dataset, scene, *views, gt_scale=scale)]
+    if is_eth3d_scene(folder):  # same file names
+        return []
+    return [
+        PairFiles(
+            _float_release(folder, scene, views.disparity_gt),
+            scene,
+            *views,
+            gt_scale=None if views.disparity_gt is None else 1.0,
+            mask=find_file(folder, ["mask0nocc.png"]),
+            calibration=find_file(folder, ["calib.txt"]),
+        )
+    ]
+
+
+def _float_release(folder: Path, scene: str, disparity: Path | None) -> str:
+    """Label of a scene with im0.png and im1.png: by the nearest folder that tells, else by its files and its name."""
+    for name in parent_names(folder):
+        if _MIDDEVAL3.fullmatch(name):
+            return "middeval3"
+        year = folder_year(name, years=("2014", "2021"))
+        if year is not None:
+            return f"middlebury-{year}"
+    if disparity is not None and disparity.name == "disp0GT.pfm":
+        return "middeval3"
+    if _SCENES_2014.fullmatch(scene):
+        return "middlebury-2014"
+    return "middlebury-2021" if _SCENES_2021.fullmatch(scene) else "middlebury"

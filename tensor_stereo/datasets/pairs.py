@@ -1,0 +1,117 @@
+"""From the files of a pair to its tensors."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import Dataset
+
+from tensor_stereo.types import StereoPair
+
+from .files import PairFiles, check_gt_scale, missing_scale
+from .images import read_disparity_png, read_image, read_occlusion_mask
+from .pfm import FloatMap, read_pfm
+
+
+def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
+    """Read one pair.
+
+    Args:
+        files: as found by :func:`~tensor_stereo.datasets.discovery.find_pairs`.
+        gt_scale: replaces ``files.gt_scale``: stored value / gt_scale = disparity in px.
+
+    Returns:
+        The pair on the CPU. ``disparity_gt`` is NaN where the release does not know it (0 in integer maps, infinite in
+        float maps). ``occluded`` comes from the release: its mask, or the pixels that KITTI's map of visible pixels
+        leaves out; it is False where ground truth is unknown, and None for releases without it (Middlebury's but
+        MiddEval3).
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if a file is damaged, sizes differ, or no scale is known; the message names the files.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = [Path(folder, name) for name in ("view1.ppm", "view5.ppm", "disp1.pgm")]
+    ...     for path, header in zip(paths, (b"P6 2 1 255 ", b"P6 2 1 255 ", b"P5 2 1 255 ")):
+    ...         _ = path.write_bytes(header + bytes([0, 6, 0, 6, 0, 6]))
+    ...     read_pair(PairFiles("middlebury-2005", "Art", *paths, gt_scale=3.0)).disparity_gt
+    tensor([[nan, 2.]])
+    """
+    check_gt_scale(gt_scale)
+    image0, image1 = read_image(files.image0), read_image(files.image1)
+    if image0.shape != image1.shape:
+        shapes = f"{files.image0} has {tuple(image0.shape)}, {files.image1} has {tuple(image1.shape)}"
+        raise ValueError(f"both views must have one shape (C, H, W): {shapes}")
+    disparity = None if files.disparity_gt is None else _read_disparity(files, files.disparity_gt, gt_scale)
+    occluded = None if disparity is None else _read_occluded(files, disparity, gt_scale)
+    for path, values in ((files.disparity_gt, disparity), (files.mask or files.disparity_noc_gt, occluded)):
+        if values is not None and values.shape != image0.shape[1:]:
+            expected, given = tuple(image0.shape[1:]), values.shape
+            raise ValueError(f"{path} must have the size (H, W) = {expected} of {files.image0}, got {given}")
+    return StereoPair(
+        name=files.scene,
+        image0=image0,
+        image1=image1,
+        disparity_gt=None if disparity is None else torch.from_numpy(disparity),
+        occluded=None if occluded is None else torch.from_numpy(occluded),
+        dataset=files.dataset,
+    )
+
+
+class PairDataset(Dataset[StereoPair]):
+    """Map-style data set over the files of pairs; each access reads from disk.
+
+    Pairs differ in size, so a ``DataLoader`` needs a ``collate_fn`` that does not stack, as ``list``.
+
+    Args:
+        files: in the order of the data set, as found by :func:`~tensor_stereo.datasets.discovery.find_pairs`.
+        gt_scale: as in :func:`read_pair`, for every pair.
+
+    >>> len(PairDataset([]))
+    0
+    """
+
+    def __init__(self, files: Sequence[PairFiles], *, gt_scale: float | None = None) -> None:
+        check_gt_scale(gt_scale)
+        self.files = tuple(files)
+        self.gt_scale = gt_scale
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, index: int) -> StereoPair:
+        return read_pair(self.files[operator.index(index)], gt_scale=self.gt_scale)
+
+
+def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> FloatMap:
+    """(H, W) float32 in px, NaN where unknown."""
+    scale = files.gt_scale if gt_scale is None else gt_scale
+    if path.suffix != ".pfm":
+        if scale is None:
+            raise missing_scale(files)
+        return read_disparity_png(path, scale)
+    stored = read_pfm(path)
+    if stored.ndim != 2:
+        raise ValueError(f"{path} must have one channel (Pf), got shape {stored.shape}")
+    disparity = stored / np.float32(1.0 if scale is None else scale)
+    disparity[~np.isfinite(disparity)] = np.nan
+    return disparity
+
+
+def _read_occluded(files: PairFiles, disparity: FloatMap, gt_scale: float | None) -> NDArray[np.bool_] | None:
+    """(H, W) bool from whatever the release tells of occlusion, None if it is silent."""
+    if files.mask is not None:
+        return read_occlusion_mask(files.mask)
+    if files.disparity_noc_gt is None:
+        return None
+    visible = _read_disparity(files, files.disparity_noc_gt, gt_scale)
+    if visible.shape != disparity.shape:
+        sizes = f"{disparity.shape} of {files.disparity_gt}, got {visible.shape}"
+        raise ValueError(f"{files.disparity_noc_gt} must have the size (H, W) = {sizes}")
+    return np.isfinite(disparity) & np.isnan(visible)

@@ -1,0 +1,96 @@
+"""An evaluation as files: summary.json, settings.json, the tables as Markdown, one figure per scene and detector."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from tensor_stereo.configs import EvaluationConfig
+from tensor_stereo.evaluation import PairEvaluation
+from tensor_stereo.features import to_gray
+from tensor_stereo.objects import trace_objects
+from tensor_stereo.reports.figures import draw_classification, write_figure
+from tensor_stereo.reports.tables import Table, paper_tables, to_markdown
+
+PACKAGES = ("tensor-stereo", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "mahotas")
+
+
+def write_evaluation(
+    results: Iterable[PairEvaluation],
+    config: EvaluationConfig,
+    *,
+    source: dict[str, Any],
+    out: Path | None = None,
+) -> list[Table]:
+    """Consume an evaluation and make the paper's tables of it.
+
+    Args:
+        results: as :func:`tensor_stereo.evaluation.evaluate_dataset` yields them.
+        config: the settings that they were made with.
+        source: what was evaluated, for settings.json.
+        out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.
+
+    Returns:
+        Tables 1-4 for the detectors of ``config``, Table 5 and the run-time by stage.
+
+    Raises:
+        ValueError: if ``out`` holds the results of other settings.
+    """
+    settings = {"config": asdict(config), "source": source, "versions": {name: version(name) for name in PACKAGES}}
+    if out is not None:
+        _claim_folder(out, settings)
+    rows: list[dict[str, Any]] = []
+    for result in results:
+        rows += result.rows()
+        if out is not None:
+            draw_evaluation(result, config, out / "figures" / f"{result.pair.name}-{result.detector}.png")
+    tables = paper_tables(rows, restriction=config.restriction)
+    if out is not None:
+        (out / "summary.json").write_text(json.dumps(_without_nan(rows), indent=1) + "\n")
+        (out / "tables.md").write_text("\n".join(to_markdown(table) for table in tables))
+    return tables
+
+
+def draw_evaluation(result: PairEvaluation, config: EvaluationConfig, path: Path) -> None:
+    """Draw the constrained variant of one pair and detector."""
+    constrained = result.variants[-1]
+    pair = result.pair
+    contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in (pair.image0, pair.image1)]
+    figure = draw_classification(
+        pair.image0,
+        pair.image1,
+        constrained.matches,
+        constrained.verdicts[config.restriction],
+        constrained.graphs.adjacency0,
+        constrained.graphs.adjacency1,
+        correct=result.correct,
+        valid=result.valid,
+        contours0=contours[0],
+        contours1=contours[1],
+        title=f"{pair.name}, {result.detector.upper()}, {config.restriction}, constrained by objects",
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_figure(figure, path)
+
+
+def _claim_folder(out: Path, settings: dict[str, Any]) -> None:
+    path = out / "settings.json"
+    text = json.dumps(settings, indent=1) + "\n"
+    if path.exists() and path.read_text() != text:
+        raise ValueError(f"out: {out} holds the results of other settings ({path.name} differs); name another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def _without_nan(value: Any) -> Any:
+    """JSON has no NaN: rates with an empty denominator become null."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,252 @@
+"""Figures of classified matches, drawn with matplotlib objects alone: no global state, no window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tensor_stereo.types import Adjacency, Classification, Matches, Relation, check_vector
+
+# hues that stay apart for the common colour blindnesses (Okabe & Ito, 2008)
+BLUE, VERMILLION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#595959"
+DPI = 100
+_PANEL_AREA_IN2, _MIN_WIDTH_IN, _MAX_WIDTH_IN = 22.0, 4.6, 9.0  # of one of the four panels
+_GAP_IN, _TITLE_IN, _LABEL_IN, _LEGEND_IN = 0.12, 0.36, 0.24, 0.34
+_FONT_SIZE = 9
+_GREY_STEP = 8  # of the images; a coarse scale halves the file
+
+
+@dataclass(frozen=True)
+class _Class:
+    """Matches that look alike."""
+
+    label: str
+    mask: NDArray[np.bool_]
+    color: str
+    marker: str
+
+    def _style(self) -> dict[str, Any]:
+        disc = {"markersize": 5.0, "markeredgecolor": "white", "markeredgewidth": 0.5}
+        cross = {"markersize": 4.5, "markeredgewidth": 1.2}
+        return {"linestyle": "none", "marker": self.marker, "color": self.color} | (
+            disc if self.marker == "o" else cross
+        )
+
+    def draw(self, axes: Axes, keypoints: NDArray[np.floating]) -> None:
+        axes.plot(*keypoints[self.mask].T, **self._style())
+
+    def handle(self) -> Line2D:
+        return Line2D([], [], label=f"{self.label}: {int(self.mask.sum())}", **self._style())
+
+
+def draw_classification(
+    image0: Tensor,
+    image1: Tensor,
+    matches: Matches,
+    classification: Classification,
+    adjacency0: Adjacency,
+    adjacency1: Adjacency,
+    *,
+    correct: Tensor | None = None,
+    valid: Tensor | None = None,
+    contours0: Sequence[Tensor] | None = None,
+    contours1: Sequence[Tensor] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw one pair: above its matches by verdict and truth, below the Delaunay graphs of both views.
+
+    The marker is the verdict, a disc for kept and a cross for rejected; the colour is the truth, blue for correct,
+    vermillion for incorrect, grey for unknown. Without ground truth the classes are kept, rejected and untested. Edges
+    that both graphs have are told from those of one view only.
+
+    Args:
+        image0: (C, H, W) uint8 of view 0, C = 1 or 3 (RGB); drawn in grey so that colours mean matches only.
+        image1: (C, H, W) uint8 of view 1.
+        matches: M matches of one pair.
+        classification: their verdicts.
+        adjacency0: graph of view 0 over the M matches.
+        adjacency1: graph of view 1.
+        correct: (M,) bool against ground truth, together with ``valid``.
+        valid: (M,) bool, ground truth is known.
+        contours0: (L, 2) chains of pixels (x, y) of view 0, as :func:`tensor_stereo.objects.trace_objects` gives them.
+        contours1: the same of view 1.
+        title: one line.
+
+    Returns:
+        A figure of 100 dots per inch with an Agg canvas.
+
+    Raises:
+        ValueError: if there is not just one pair, a length is not M, or only one of ``correct`` and ``valid`` is given.
+
+    Example:
+        >>> import torch
+        >>> image, points = torch.zeros(1, 20, 30, dtype=torch.uint8), torch.tensor([[3.0, 4.0]])
+        >>> one, none = torch.ones(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+        >>> graph = Adjacency(torch.zeros(2, dtype=torch.int64), none, torch.tensor([0, 1]))
+        >>> verdict = Classification(one > 0, one.to(torch.int8), one, one, one)
+        >>> matches = Matches(points, points, torch.tensor([0, 1]))
+        >>> len(draw_classification(image, image, matches, verdict, graph, graph).axes)
+        4
+    """
+    if matches.num_pairs != 1:
+        raise ValueError(f"matches must be of one pair, got {matches.num_pairs}")
+    for name, adjacency in (("adjacency0", adjacency0), ("adjacency1", adjacency1)):
+        if adjacency.num_nodes != matches.num_matches:
+            raise ValueError(f"{name} must have {matches.num_matches} nodes, one per match, got {adjacency.num_nodes}")
+    classes = _classes(classification, correct, valid, matches.num_matches)
+    keypoints = [points.numpy(force=True) for points in (matches.keypoints0, matches.keypoints1)]
+    edges = [_edges(adjacency0), _edges(adjacency1)]
+    shared = [np.isin(edges[view], edges[1 - view]) for view in (0, 1)]
+
+    layout = _Layout(image0, title)
+    for view, (image, contours) in enumerate(((image0, contours0), (image1, contours1))):
+        gray = _gray(image)
+        upper = layout.panel(0, view, f"view {view} ({('left', 'right')[view]})", gray, strength=0.5)
+        for item in reversed(classes):  # the first on top
+            item.draw(upper, keypoints[view])
+        num_edges, num_shared = len(edges[view]), int(shared[view].sum())
+        label = f"Delaunay graph of view {view}: {num_edges} edges, {num_shared} of them in both views"
+        lower = layout.panel(1, view, label, gray, strength=0.25)
+        if contours is not None:
+            _draw_lines(lower, [_closed(contour.numpy(force=True)) for contour in contours], GREEN, 1.6)
+        ends = np.stack(np.divmod(edges[view], max(matches.num_matches, 1)), 1)
+        segments = keypoints[view][ends]  # (E, 2, 2)
+        _draw_lines(lower, segments[~shared[view]], VERMILLION, 0.6)
+        _draw_lines(lower, segments[shared[view]], BLUE, 0.9)
+        lower.plot(*keypoints[view].T, linestyle="none", marker=".", markersize=2.5, color="black")
+    layout.legend(0, [item.handle() for item in classes])
+    lines = {"edge in both views": BLUE, "edge in one view only": VERMILLION}
+    if contours0 is not None or contours1 is not None:
+        lines["object contour"] = GREEN
+    layout.legend(1, [Line2D([], [], color=color, linewidth=1.5, label=label) for label, color in lines.items()])
+    return layout.figure
+
+
+def write_figure(figure: Figure, path: Path | str) -> None:
+    """Write a figure in the format that the ending of ``path`` names; equal figures give equal PNG files.
+
+    Args:
+        figure: any matplotlib figure.
+        path: file to write, .png or another format of matplotlib; its folder must exist.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+        ValueError: if matplotlib does not know the format.
+
+    Example:
+        >>> import io, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_figure(Figure(figsize=(1, 1)), Path(folder) / "empty.png")
+        ...     print([path.name for path in Path(folder).iterdir()])
+        ['empty.png']
+    """
+    path = Path(path)
+    metadata = {"Software": None} if path.suffix == ".png" else None  # no version number in the file
+    figure.savefig(path, dpi=figure.dpi, metadata=metadata)
+
+
+class _Layout:
+    """Two rows of two panels with the images' aspect, a legend under each row, sizes in inches."""
+
+    def __init__(self, image: Tensor, title: str) -> None:
+        height, width = image.shape[-2:]
+        aspect = width / height
+        self.width = float(np.clip((_PANEL_AREA_IN2 * aspect) ** 0.5, _MIN_WIDTH_IN, _MAX_WIDTH_IN))
+        self.height = self.width / aspect
+        self.row = _LABEL_IN + self.height + _LEGEND_IN
+        self.size = (2 * self.width + 3 * _GAP_IN, (_TITLE_IN if title else 0) + 2 * self.row + _GAP_IN)
+        self.figure = Figure(figsize=self.size, dpi=DPI)
+        FigureCanvasAgg(self.figure)
+        if title:
+            self.figure.text(0.5, 1 - 0.5 * _TITLE_IN / self.size[1], title, ha="center", va="center", fontsize=12)
+
+    def _bottom(self, row: int) -> float:
+        return _GAP_IN + (1 - row) * self.row + _LEGEND_IN
+
+    def panel(self, row: int, column: int, label: str, gray: NDArray[np.uint8], *, strength: float) -> Axes:
+        """Axes in pixel coordinates over the image, faded towards white."""
+        height, width = gray.shape
+        left = _GAP_IN + column * (self.width + _GAP_IN)
+        box = np.array([left, self._bottom(row), self.width, self.height]) / np.tile(self.size, 2)
+        axes = self.figure.add_axes(tuple(box), xticks=[], yticks=[])
+        faded = (255 - strength * (255 - gray.astype(np.float32))).astype(np.uint8)
+        axes.imshow(faded, cmap="gray", vmin=0, vmax=255, interpolation="bilinear")
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), autoscale_on=False)
+        axes.set_title(label, pad=3, fontsize=_FONT_SIZE)
+        axes.spines[:].set_visible(False)
+        return axes
+
+    def legend(self, row: int, handles: list[Line2D]) -> None:
+        y = (self._bottom(row) - 0.5 * _LEGEND_IN) / self.size[1]
+        options = {"handlelength": 1.4, "handletextpad": 0.5, "columnspacing": 1.6, "borderpad": 0, "frameon": False}
+        self.figure.legend(
+            handles=handles,
+            loc="center",
+            bbox_to_anchor=(0.5, y),
+            ncols=len(handles),
+            fontsize=_FONT_SIZE,
+            **options,
+        )
+
+
+def _classes(
+    classification: Classification, correct: Tensor | None, valid: Tensor | None, num_matches: int
+) -> list[_Class]:
+    """How the matches are told apart, the errors that matter most first."""
+    check_vector("classification.inlier", classification.inlier, num_matches)
+    kept: NDArray[np.bool_] = classification.inlier.numpy(force=True)
+    if correct is None and valid is None:
+        untested = classification.relation.numpy(force=True) == Relation.UNTESTED
+        return [
+            _Class("kept", kept, BLUE, "o"),
+            _Class("rejected", ~kept & ~untested, VERMILLION, "x"),
+            _Class("untested", untested, GREY, "x"),
+        ]
+    if correct is None or valid is None:
+        raise ValueError("correct and valid must be given together, got only one of them")
+    check_vector("correct", correct, num_matches)
+    check_vector("valid", valid, num_matches)
+    right, known = correct.numpy(force=True), valid.numpy(force=True)
+    classes = [
+        _Class("kept, incorrect", kept & known & ~right, VERMILLION, "o"),
+        _Class("kept, correct", kept & known & right, BLUE, "o"),
+        _Class("rejected, incorrect", ~kept & known & ~right, VERMILLION, "x"),
+        _Class("rejected, correct", ~kept & known & right, BLUE, "x"),
+        _Class("kept, truth unknown", kept & ~known, GREY, "o"),
+        _Class("rejected, truth unknown", ~kept & ~known, GREY, "x"),
+    ]
+    return [item for item in classes if item.color != GREY or item.mask.any()]
+
+
+def _edges(adjacency: Adjacency) -> NDArray[np.int64]:
+    """(E,) edges, each once, as row * M + column."""
+    rows, columns = adjacency.row_indices.numpy(force=True), adjacency.col_indices.numpy(force=True)
+    keys: NDArray[np.int64] = rows * adjacency.num_nodes + columns
+    return keys[rows < columns]
+
+
+def _draw_lines(axes: Axes, lines: Any, color: str, width: float) -> None:
+    axes.add_collection(LineCollection(lines, colors=color, linewidths=width), autolim=False)
+
+
+def _closed(contour: NDArray[Any]) -> NDArray[Any]:
+    return np.concatenate([contour, contour[:1]])
+
+
+def _gray(image: Tensor) -> NDArray[np.uint8]:
+    """(H, W) luma of a (C, H, W) image."""
+    planes = image.numpy(force=True)
+    if len(planes) == 1:
+        return planes[0]  # type: ignore[no-any-return]
+    return np.tensordot([0.299, 0.587, 0.114], planes, 1).round().astype(np.uint8)  # ITU-R BT.601

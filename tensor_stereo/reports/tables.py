@@ -1,0 +1,255 @@
+"""The paper's tables from the records of an evaluation, in one neutral form.
+
+Source: Bustos, Vargas, Trujillo, CIARP 2016, section 4. Tables 1-4 hold the rates of one detector each, Table 5 the
+run-times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tensor_stereo.configs import DETECTORS, Restriction
+
+Row = Mapping[str, Any]
+Cell = str | int | float
+Key = tuple[str, str, str]  # scene, detector, variant
+
+SCENES = ("Art", "Books", "Cones", "Dolls", "Laundry", "Moebius", "Reindeer", "Teddy")  # order of the paper
+VARIANTS = ("unconstrained", "constrained")
+RATES = {"sensitivity": "sens.", "specificity": "spec.", "ppv": "PPV", "npv": "NPV"}
+UNDEFINED = "–"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Numbers under a heading, for any kind of print.
+
+    Attributes:
+        title: one line.
+        columns: C headings, the first one of the row labels.
+        rows: C cells each; NaN means undefined or not measured.
+        decimals: digits after the point of floating point cells.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    decimals: int = 2
+
+    def __post_init__(self) -> None:
+        for index, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise ValueError(
+                    f"rows must have {len(self.columns)} cells, one per column; row {index} has {len(row)}"
+                )
+
+    def text_rows(self) -> list[list[str]]:
+        """The rows as they are printed: floating point cells rounded, NaN as an en dash."""
+        return [[_text(cell, self.decimals) for cell in row] for row in self.rows]
+
+
+def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> list[Table]:
+    """All tables for the detectors that the records name.
+
+    Args:
+        rows: one record per scene, detector, variant and restriction, as
+            :func:`tensor_stereo.evaluation.score_dataset` documents them; None in place of a number means NaN.
+        restriction: the one whose records are shown.
+
+    Returns:
+        Tables 1-4 as far as there are records, Table 5, the run-time by stage, and the putative matches.
+
+    Raises:
+        ValueError: if a record lacks a field, repeats another one, or names an unknown detector or variant.
+
+    Example:
+        >>> [table.title for table in paper_tables([])]  # doctest: +ELLIPSIS
+        ['Table 5. Run-time...', 'Run-time by stage...', 'Putative matches...']
+    """
+    return [
+        *(rates_table(rows, detector, restriction=restriction) for detector in _detectors(_index(rows, restriction))),
+        runtime_table(rows, restriction=restriction),
+        stage_table(rows, restriction=restriction),
+        matches_table(rows, restriction=restriction),
+    ]
+
+
+def rates_table(rows: Sequence[Row], detector: str, *, restriction: Restriction = "cardinality") -> Table:
+    """One of Tables 1-4: scenes x (sensitivity, specificity, PPV, NPV), without and with Restriction 3.
+
+    The last row is the mean over the scenes; undefined rates are left out of it.
+
+    Example:
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> record |= dict(sensitivity=0.875, specificity=0.5, ppv=0.25, npv=float("nan"))
+        >>> rates_table([record], "fast").text_rows()[0][5:]
+        ['0.88', '0.50', '0.25', '–']
+    """
+    if detector not in DETECTORS:
+        raise ValueError(f"detector must be one of {', '.join(DETECTORS)}, got {detector!r}")
+    records = _index(rows, restriction)
+    scenes = _scenes(key for key in records if key[1] == detector)
+    keys = [(variant, rate) for variant in VARIANTS for rate in RATES]
+    body = [
+        (scene, *(_value(records.get((scene, detector, variant)), rate) for variant, rate in keys)) for scene in scenes
+    ]
+    number = DETECTORS.index(detector) + 1
+    return Table(
+        title=f"Table {number}. {detector.upper()}, {restriction}: unconstrained (U) and constrained by objects (C)",
+        columns=("scene", *(f"{variant[0].upper()} {RATES[rate]}" for variant, rate in keys)),
+        rows=_with_mean(body),
+    )
+
+
+def runtime_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
+    """Table 5: run-time of the constrained variant, all stages together, in ms per scene and detector.
+
+    Example:
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> runtime_table([record | {"seconds": {"detect": 0.01, "match": 0.02}}]).text_rows()[0]
+        ['Art', '30.0']
+    """
+    title = f"Table 5. Run-time of the constrained variant in ms, {restriction}"
+    records = _index_variant(rows, restriction, "constrained")
+    milliseconds = {key: 1000 * sum(_field(record, "seconds").values()) for key, record in records.items()}
+    detectors = _detectors(records)
+    body = [
+        (scene, *(milliseconds.get((scene, detector, "constrained"), math.nan) for detector in detectors))
+        for scene in _scenes(records)
+    ]
+    return Table(title, ("scene", *(detector.upper() for detector in detectors)), _with_mean(body), decimals=1)
+
+
+def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
+    """Run-time of the constrained variant by stage, in ms per detector, as the mean over the scenes.
+
+    Example:
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> stage_table([record | {"seconds": {"detect": 0.01, "match": 0.02}}]).text_rows()
+        [['FAST', '10.0', '20.0', '30.0']]
+    """
+    records = _index_variant(rows, restriction, "constrained")
+    stages = list(dict.fromkeys(stage for record in records.values() for stage in _field(record, "seconds")))
+    body: list[tuple[Cell, ...]] = []
+    for detector in _detectors(records):
+        seconds = [_field(record, "seconds") for key, record in records.items() if key[1] == detector]
+        means = [1000 * _mean([scene.get(stage, math.nan) for scene in seconds]) for stage in stages]
+        total = 1000 * _mean([sum(scene.values()) for scene in seconds])
+        body.append((detector.upper(), *means, total))
+    title = f"Run-time by stage of the constrained variant in ms, {restriction}, mean over the scenes"
+    return Table(title, ("detector", *stages, "total"), tuple(body), decimals=1)
+
+
+def matches_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
+    """What the detectors offer: putative matches, and the fraction of them that is estimated incorrectly.
+
+    Example:
+        >>> record = dict(scene="Art", detector="fast", variant="unconstrained", restriction="cardinality")
+        >>> matches_table([record | dict(num_matches=700, num_valid=690, fraction_incorrect=0.55)]).text_rows()[0]
+        ['Art', '700', '0.55']
+    """
+    records = _index_variant(rows, restriction, "unconstrained")
+    detectors = _detectors(records)
+    body: list[tuple[Cell, ...]] = []
+    for scene in _scenes(records):
+        found = [records.get((scene, detector, "unconstrained")) for detector in detectors]
+        body.append((scene, *(_value(r, name) for r in found for name in ("num_matches", "fraction_incorrect"))))
+    headings = [f"{detector.upper()} {what}" for detector in detectors for what in ("matches", "incorrect")]
+    title = "Putative matches and the fraction of those with known ground truth that is incorrect"
+    return Table(title, ("scene", *headings), tuple(body))
+
+
+def to_markdown(table: Table) -> str:
+    """A Markdown table under its title, columns aligned in plain text too, with a line break at the end.
+
+    Example:
+        >>> print(to_markdown(Table("Rates", ("scene", "sens."), (("Art", 0.875),))), end="")
+        **Rates**
+        <BLANKLINE>
+        | scene | sens. |
+        |:------|------:|
+        | Art   |  0.88 |
+    """
+    lines = [[cell.replace("|", "\\|") for cell in line] for line in (table.columns, *table.text_rows())]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(table.columns))]
+    # labels to the left, numbers to the right
+    aligns = ["<", *">" * (len(widths) - 1)]
+    styles = list(zip(aligns, widths, strict=True))
+    rule = "|".join(":" + "-" * (width + 1) if align == "<" else "-" * (width + 1) + ":" for align, width in styles)
+    header, *body = (
+        "| " + " | ".join(f"{cell:{align}{width}}" for cell, (align, width) in zip(line, styles, strict=True)) + " |"
+        for line in lines
+    )
+    return "\n".join([f"**{table.title}**", "", header, f"|{rule}|", *body]) + "\n"
+
+
+def _index(rows: Sequence[Row], restriction: Restriction) -> dict[Key, Row]:
+    """Records of one restriction by (scene, detector, variant)."""
+    index: dict[Key, Row] = {}
+    for row in rows:
+        scene, detector, variant = (_field(row, name) for name in ("scene", "detector", "variant"))
+        if detector not in DETECTORS:
+            raise ValueError(f"detector must be one of {', '.join(DETECTORS)}, got {detector!r}")
+        if variant not in VARIANTS:
+            raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
+        if _field(row, "restriction") != restriction:
+            continue
+        key = _display_name(scene), detector, variant
+        if key in index:
+            raise ValueError(
+                f"rows must not repeat a record, got {scene!r}, {detector}, {variant}, {restriction} twice"
+            )
+        index[key] = row
+    return index
+
+
+def _index_variant(rows: Sequence[Row], restriction: Restriction, variant: str) -> dict[Key, Row]:
+    return {key: record for key, record in _index(rows, restriction).items() if key[2] == variant}
+
+
+def _with_mean(body: Sequence[tuple[Cell, ...]]) -> tuple[tuple[Cell, ...], ...]:
+    if not body:
+        return ()
+    return (*body, ("mean", *(_mean(column) for column in list(zip(*body, strict=True))[1:])))
+
+
+def _mean(values: Iterable[Cell]) -> float:
+    known = [float(value) for value in values if not math.isnan(float(value))]
+    return math.fsum(known) / len(known) if known else math.nan
+
+
+def _detectors(records: Iterable[Key]) -> list[str]:
+    """Detectors of the records in the order of the paper's tables."""
+    present = {key[1] for key in records}
+    return [detector for detector in DETECTORS if detector in present]
+
+
+def _scenes(records: Iterable[Key]) -> list[str]:
+    """Scenes of the records, those of the paper first and in its order, then the others by name."""
+    present = {key[0] for key in records}
+    return [scene for scene in SCENES if scene in present] + sorted(present - set(SCENES))
+
+
+def _display_name(scene: str) -> str:
+    """The paper writes its scenes with a capital; other names stay as they are."""
+    return next((name for name in SCENES if name.casefold() == scene.casefold()), scene)
+
+
+def _value(record: Row | None, name: str) -> Cell:
+    value = None if record is None else _field(record, name)
+    return math.nan if value is None else value
+
+
+def _field(row: Row, name: str) -> Any:
+    if name not in row:
+        raise ValueError(f"rows must have the field {name!r}, got {', '.join(map(str, row))}")
+    return row[name]
+
+
+def _text(cell: Cell, decimals: int) -> str:
+    if isinstance(cell, float):
+        return UNDEFINED if math.isnan(cell) else f"{cell:.{decimals}f}"
+    return str(cell)

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 import polars as pl
+import torch
 from torch import Tensor
 
 from tensor_stereo.configs import ClassifyConfig, Detector, EvaluationConfig, Restriction
 from tensor_stereo.filters import classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.metrics import Confusion, confusion_update, matches_against_gt
+from tensor_stereo.metrics import Confusion, IsolatedCounts, confusion_update, isolated_update, matches_against_gt
+from tensor_stereo.objects import isolated_matches
 from tensor_stereo.pipeline import Stopwatch, group_pairs, match_pairs, to_gray_pairs
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
@@ -57,6 +59,14 @@ class PairEvaluation:
     valid: Tensor
     variants: tuple[VariantEvaluation, ...]
 
+    def isolated(self) -> IsolatedCounts:
+        """How many correct and incorrect matches join two objects that no other match joins."""
+        constrained = self.variants[-1].matches
+        if constrained.group is None:
+            raise ValueError("variants must end with the constrained one, whose matches have a group")
+        alone = isolated_matches(constrained.group, constrained.ptr)
+        return isolated_update(alone, self.correct, self.valid)
+
     def rows(self) -> list[dict[str, Any]]:
         """One record per variant and restriction, as :func:`score_dataset` documents them."""
         return [
@@ -69,6 +79,8 @@ def evaluate_dataset(
 ) -> Iterator[PairEvaluation]:
     """Classify every pair of a dataset with every detector and hold the verdicts against ground truth.
 
+    Each detector runs once on noise first, so that no scene's run-time contains the start-up of libraries.
+
     Args:
         dataset: pairs with ``disparity_gt``.
         config: settings of every step.
@@ -79,6 +91,10 @@ def evaluate_dataset(
     Raises:
         ValueError: for a pair without ground truth.
     """
+    noise = torch.randint(0, 256, (1, 96, 96), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    blank = StereoPair("warm-up", noise, noise, torch.zeros(96, 96))
+    for detector in config.detectors:
+        evaluate_pair(blank, detector, config)
     for pair in dataset:
         for detector in config.detectors:
             yield evaluate_pair(pair, detector, config)

@@ -19,7 +19,7 @@ _NONE = torch.iinfo(torch.int64).max  # key of "no candidate", larger than that 
 _INDEX_BITS = 32
 _CHUNK_VALUES = 2**17  # descriptor values that are compared at a time: 512 kB, which stay in the cache
 _CHUNK_CANDIDATES = 2**18  # candidate pairs that are listed at a time
-_CHUNK_DENSE = 2**22  # entries of a dense SSD matrix
+_CHUNK_DENSE = 2**20  # entries of a dense SSD matrix that are formed at a time
 _MAX_COORDINATE_PX = 2**24
 _MAX_DESCRIPTOR = 2**50  # keeps the SSD finite
 

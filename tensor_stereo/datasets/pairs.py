@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import operator
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +69,8 @@ def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
 class PairDataset(Dataset[StereoPair]):
     """Map-style data set over the files of pairs; each access reads from disk.
 
-    Pairs differ in size, so a ``DataLoader`` needs a ``collate_fn`` that does not stack, as ``list``.
+    A pair is named after its scene, or ``dataset/scene`` where several releases have a scene of that name. Pairs differ
+    in size, so a ``DataLoader`` needs a ``collate_fn`` that does not stack, as ``list``.
 
     Args:
         files: in the order of the data set, as found by :func:`~tensor_stereo.datasets.discovery.find_pairs`.
@@ -81,12 +84,15 @@ class PairDataset(Dataset[StereoPair]):
         check_gt_scale(gt_scale)
         self.files = tuple(files)
         self.gt_scale = gt_scale
+        scenes = Counter(pair.scene for pair in self.files)
+        self.names = [f"{p.dataset}/{p.scene}" if scenes[p.scene] > 1 else p.scene for p in self.files]
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __getitem__(self, index: int) -> StereoPair:
-        return read_pair(self.files[operator.index(index)], gt_scale=self.gt_scale)
+        k = operator.index(index)
+        return replace(read_pair(self.files[k], gt_scale=self.gt_scale), name=self.names[k])
 
 
 def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> FloatMap:

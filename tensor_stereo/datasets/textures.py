@@ -49,7 +49,7 @@ def random_texture(rng: np.random.Generator, kind: str, *, bright: bool) -> Text
     lattice = rng.uniform(-1, 1, (LATTICE, LATTICE))
     base = rng.uniform(150, 185) if bright else rng.uniform(60, 95)
     if kind == "mixed":
-        return Texture(base, rng.uniform(25, 40), (40.0, 17.0, 8.0, 4.0), lattice)
+        return Texture(base, rng.uniform(30, 42), (34.0, 13.0, 6.0, 3.5), lattice)
     if kind == "fine":
         return Texture(base, rng.uniform(30, 45), (9.0, 4.5, 3.0), lattice)
     if kind == "weak":

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.configs import FASTConfig
-from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.images import check_range, join_images, strongest_first, to_gray
 from tensor_stereo.features.windows import check_window_px, extract_windows
 from tensor_stereo.types import Features
 
@@ -19,7 +19,6 @@ _CIRCLE = [
     *((-x, -y) for x, y in _QUADRANT),
     *((y, -x) for x, y in _QUADRANT),
 ]
-_ARC = 9  # contiguous pixels of the circle that must all differ
 
 
 def detect_fast(images: Tensor, config: FASTConfig | None = None) -> Features:
@@ -54,7 +53,7 @@ def detect_fast(images: Tensor, config: FASTConfig | None = None) -> Features:
     check_range("FASTConfig.max_keypoints", config.max_keypoints, 1, 2**31 - 1)
     check_window_px("FASTConfig.window_px", config.window_px)
     gray = to_gray(images)
-    detected = map_images(lambda image: _detect(image, config), gray.cpu())
+    detected = [_detect(image, config) for image in gray.cpu()[:, 0]]  # too short a step for threads to pay
     (keypoints, scores), ptr = join_images(detected, [(2,), ()], gray.device)
     return Features(keypoints, ptr, extract_windows(gray, keypoints, ptr, window_px=config.window_px), scores)
 
@@ -92,6 +91,13 @@ def corner_score(image: Tensor, pixels: Tensor) -> Tensor:
     dx, dy = torch.tensor(_CIRCLE, device=image.device).unbind(1)
     levels = image.to(torch.int16)
     difference = levels[y[:, None] + dy, x[:, None] + dx] - levels[y, x][:, None]  # (N, 16)
-    arcs = torch.cat([difference, difference[:, : _ARC - 1]], 1).unfold(1, _ARC, 1)  # (N, 16, 9)
-    brighter, darker = arcs.amin(2).amax(1), (-arcs).amin(2).amax(1)
+    brighter, darker = (_weakest_of_arcs(d).amax(1) for d in (difference, -difference))
     return torch.maximum(brighter, darker).clamp(min=0).to(torch.float32) - 1
+
+
+def _weakest_of_arcs(values: Tensor) -> Tensor:
+    """(N, 16) minimum of each run of 9 along the circle: runs of 2, 4, 8, and one more."""
+    least = values
+    for length in (1, 2, 4):
+        least = torch.minimum(least, least.roll(-length, 1))
+    return torch.minimum(least, values.roll(-8, 1))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.evaluation import PairEvaluation
 from tensor_stereo.features import to_gray
+from tensor_stereo.metrics import IsolatedCounts
 from tensor_stereo.objects import trace_objects
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.reports.tables import Table, paper_tables, to_markdown
@@ -36,7 +39,8 @@ def write_evaluation(
         out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.
 
     Returns:
-        Tables 1-4 for the detectors of ``config``, Table 5 and the run-time by stage.
+        Tables 1-4 for the detectors of ``config``, Table 5, the run-time by stage, the putative matches and the isolated
+        ones.
 
     Raises:
         ValueError: if ``out`` holds the results of other settings.
@@ -45,11 +49,13 @@ def write_evaluation(
     if out is not None:
         _claim_folder(out, settings)
     rows: list[dict[str, Any]] = []
+    isolated: defaultdict[str, IsolatedCounts] = defaultdict(IsolatedCounts)
     for result in results:
         rows += result.rows()
+        isolated[result.detector] += result.isolated()
         if out is not None:
-            draw_evaluation(result, config, out / "figures" / f"{result.pair.name}-{result.detector}.png")
-    tables = paper_tables(rows, restriction=config.restriction)
+            draw_evaluation(result, config, out / "figures" / f"{_file_name(result.pair.name)}-{result.detector}.png")
+    tables = [*paper_tables(rows, restriction=config.restriction), isolated_table(isolated)]
     if out is not None:
         (out / "summary.json").write_text(json.dumps(_without_nan(rows), indent=1) + "\n")
         (out / "tables.md").write_text("\n".join(to_markdown(table) for table in tables))
@@ -76,6 +82,25 @@ def draw_evaluation(result: PairEvaluation, config: EvaluationConfig, path: Path
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_figure(figure, path)
+
+
+def isolated_table(isolated: Mapping[str, IsolatedCounts]) -> Table:
+    """Matches that alone join two objects, per detector: how far "the same 3D object" goes as evidence by itself."""
+    columns = ("detector", "correct", "isolated", "fraction", "incorrect", "isolated", "fraction")
+    rows = []
+    for detector, counts in isolated.items():
+        row: list[Any] = [detector.upper()]
+        for total, alone in (
+            (counts.num_correct, counts.num_correct_isolated),
+            (counts.num_incorrect, counts.num_incorrect_isolated),
+        ):
+            row += [total, alone, alone / total if total else math.nan]
+        rows.append(tuple(row))
+    return Table("Matches that alone join two objects, over all scenes", columns, tuple(rows))
+
+
+def _file_name(scene: str) -> str:
+    return re.sub(r"[^\w.-]+", "-", scene)
 
 
 def _claim_folder(out: Path, settings: dict[str, Any]) -> None:

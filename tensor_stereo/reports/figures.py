@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from tensor_stereo.types import Adjacency, Classification, Matches, Relation, check_vector
@@ -21,10 +23,9 @@ from tensor_stereo.types import Adjacency, Classification, Matches, Relation, ch
 # hues that stay apart for the common colour blindnesses (Okabe & Ito, 2008)
 BLUE, VERMILLION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#595959"
 DPI = 100
-_PANEL_AREA_IN2, _MIN_WIDTH_IN, _MAX_WIDTH_IN = 22.0, 4.6, 9.0  # of one of the four panels
+_PANEL_AREA_IN2, _MIN_WIDTH_IN, _MAX_WIDTH_IN = 22.0, 5.2, 9.0  # of one of the four panels
 _GAP_IN, _TITLE_IN, _LABEL_IN, _LEGEND_IN = 0.12, 0.36, 0.24, 0.34
 _FONT_SIZE = 9
-_GREY_STEP = 8  # of the images; a coarse scale halves the file
 
 
 @dataclass(frozen=True)
@@ -84,13 +85,14 @@ def draw_classification(
         title: one line.
 
     Returns:
-        A figure of 100 dots per inch with an Agg canvas.
+        A figure of 100 dots per inch that pyplot does not know.
 
     Raises:
-        ValueError: if there is not just one pair, a length is not M, or only one of ``correct`` and ``valid`` is given.
+        ValueError: if there is not just one pair, a length is not M, an image is not (C, H, W), or only one of
+            ``correct`` and ``valid`` is given.
+        TypeError: if an image is not uint8.
 
     Example:
-        >>> import torch
         >>> image, points = torch.zeros(1, 20, 30, dtype=torch.uint8), torch.tensor([[3.0, 4.0]])
         >>> one, none = torch.ones(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
         >>> graph = Adjacency(torch.zeros(2, dtype=torch.int64), none, torch.tensor([0, 1]))
@@ -101,6 +103,11 @@ def draw_classification(
     """
     if matches.num_pairs != 1:
         raise ValueError(f"matches must be of one pair, got {matches.num_pairs}")
+    for name, image in (("image0", image0), ("image1", image1)):
+        if image.ndim != 3 or image.shape[0] not in (1, 3):
+            raise ValueError(f"{name} must have shape (C, H, W) with C = 1 or 3, got {tuple(image.shape)}")
+        if image.dtype != torch.uint8:
+            raise TypeError(f"{name} must be uint8, got {image.dtype}")
     for name, adjacency in (("adjacency0", adjacency0), ("adjacency1", adjacency1)):
         if adjacency.num_nodes != matches.num_matches:
             raise ValueError(f"{name} must have {matches.num_matches} nodes, one per match, got {adjacency.num_nodes}")
@@ -134,7 +141,10 @@ def draw_classification(
 
 
 def write_figure(figure: Figure, path: Path | str) -> None:
-    """Write a figure in the format that the ending of ``path`` names; equal figures give equal PNG files.
+    """Write a figure in the format that the ending of ``path`` names.
+
+    PNG files get a palette of 256 colours, which halves their size and shows no difference; equal figures give equal
+    files. Other formats are written by matplotlib as they are.
 
     Args:
         figure: any matplotlib figure.
@@ -145,15 +155,20 @@ def write_figure(figure: Figure, path: Path | str) -> None:
         ValueError: if matplotlib does not know the format.
 
     Example:
-        >>> import io, tempfile
+        >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_figure(Figure(figsize=(1, 1)), Path(folder) / "empty.png")
         ...     print([path.name for path in Path(folder).iterdir()])
         ['empty.png']
     """
     path = Path(path)
-    metadata = {"Software": None} if path.suffix == ".png" else None  # no version number in the file
-    figure.savefig(path, dpi=figure.dpi, metadata=metadata)
+    if path.suffix.lower() != ".png":
+        figure.savefig(path)
+        return
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    image.quantize(256, dither=Image.Dither.NONE).save(path, dpi=(figure.dpi, figure.dpi))
 
 
 class _Layout:
@@ -167,7 +182,6 @@ class _Layout:
         self.row = _LABEL_IN + self.height + _LEGEND_IN
         self.size = (2 * self.width + 3 * _GAP_IN, (_TITLE_IN if title else 0) + 2 * self.row + _GAP_IN)
         self.figure = Figure(figsize=self.size, dpi=DPI)
-        FigureCanvasAgg(self.figure)
         if title:
             self.figure.text(0.5, 1 - 0.5 * _TITLE_IN / self.size[1], title, ha="center", va="center", fontsize=12)
 
@@ -189,7 +203,7 @@ class _Layout:
 
     def legend(self, row: int, handles: list[Line2D]) -> None:
         y = (self._bottom(row) - 0.5 * _LEGEND_IN) / self.size[1]
-        options = {"handlelength": 1.4, "handletextpad": 0.5, "columnspacing": 1.6, "borderpad": 0, "frameon": False}
+        options = {"handlelength": 1.2, "handletextpad": 0.4, "columnspacing": 1.0, "borderpad": 0, "frameon": False}
         self.figure.legend(
             handles=handles,
             loc="center",
@@ -223,8 +237,8 @@ def _classes(
         _Class("kept, correct", kept & known & right, BLUE, "o"),
         _Class("rejected, incorrect", ~kept & known & ~right, VERMILLION, "x"),
         _Class("rejected, correct", ~kept & known & right, BLUE, "x"),
-        _Class("kept, truth unknown", kept & ~known, GREY, "o"),
-        _Class("rejected, truth unknown", ~kept & ~known, GREY, "x"),
+        _Class("kept, unknown", kept & ~known, GREY, "o"),
+        _Class("rejected, unknown", ~kept & ~known, GREY, "x"),
     ]
     return [item for item in classes if item.color != GREY or item.mask.any()]
 

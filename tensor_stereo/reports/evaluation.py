@@ -39,8 +39,7 @@ def write_evaluation(
         out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.
 
     Returns:
-        Tables 1-4 for the detectors of ``config``, Table 5, the run-time by stage, the putative matches and the isolated
-        ones.
+        Tables 1-4 for the detectors of ``config``, Table 5, the run-time by stage, the putative and the isolated matches.
 
     Raises:
         ValueError: if ``out`` holds the results of other settings.

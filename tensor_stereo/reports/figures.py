@@ -127,7 +127,7 @@ def draw_classification(
         lower = layout.panel(1, view, label, gray, strength=0.25)
         if contours is not None:
             _draw_lines(lower, [_closed(contour.numpy(force=True)) for contour in contours], GREEN, 1.6)
-        ends = np.stack(np.divmod(edges[view], max(matches.num_matches, 1)), 1)
+        ends = np.stack(np.divmod(edges[view], matches.num_matches), 1)
         segments = keypoints[view][ends]  # (E, 2, 2)
         _draw_lines(lower, segments[~shared[view]], VERMILLION, 0.6)
         _draw_lines(lower, segments[shared[view]], BLUE, 0.9)

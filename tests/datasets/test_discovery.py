@@ -162,6 +162,12 @@ def test_hidden_and_too_deep_folders_are_not_searched(tmp_path, write_scene):
     assert [pair.scene for pair in find_pairs(tmp_path / "a")] == ["cones"]
 
 
+def test_scene_folders_are_not_searched_further(tmp_path, write_scene):
+    scene = write_scene(tmp_path / "teddy", OLD, width=450)
+    write_scene(scene / "results" / "cones", OLD, width=450)
+    assert [pair.scene for pair in find_pairs(tmp_path)] == ["teddy"]
+
+
 def test_order_does_not_depend_on_the_file_system(tmp_path, write_scene, monkeypatch):
     for scene in ("Books", "art", "Dolls"):
         write_scene(tmp_path / scene, NEW, width=463)

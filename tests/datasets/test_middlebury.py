@@ -61,6 +61,7 @@ def test_scale_follows_release_and_size(tmp_path, path, width, years, scale):
         ("2003/venus", 434, OLD),  # the folder says 4, the scene 8
         ("2005/HalfSize/Art", 463, NEW),  # the folder says 2, the width 3
         ("2005/HalfSize/Art", 1390, NEW),
+        ("2005/HalfSize/Art", 800, NEW),  # wider than half size
         ("2003/conesH", 450, OLD),
         ("2003/ThirdSize/cones", 450, OLD),  # never published
     ],
@@ -78,6 +79,10 @@ def test_nearest_release_folder_wins():
     assert find_release(Path("/2005/data/2006/Chair"), years=NEW) == "2006"
     assert find_release(Path("/2003/data/2006/Chair"), years=NEW) == "2006"
     assert find_release(Path("/2003/data/Chair"), years=NEW) is None
+
+
+def test_release_folder_goes_before_the_scenes_name():
+    assert find_release(Path("/data/2006/Art"), years=NEW) == "2006"
 
 
 @pytest.mark.parametrize(

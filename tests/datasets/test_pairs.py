@@ -207,10 +207,16 @@ def test_dataset_reads_by_index_and_ends(files):
     with pytest.raises(IndexError):
         dataset[2]
     with pytest.raises(TypeError):
-        dataset["chair"]
+        dataset[0:1]
+
+
+def test_scenes_of_one_name_are_named_with_their_release(files):
+    dataset = PairDataset([files, replace(files, dataset="middlebury-2005"), replace(files, scene="table")], gt_scale=3)
+    assert [pair.name for pair in dataset] == ["middlebury/chair", "middlebury-2005/chair", "table"]
 
 
 def test_dataset_feeds_a_data_loader(files):
-    dataset = pickle.loads(pickle.dumps(PairDataset([files] * 3, gt_scale=3)))
+    scenes = ["chair", "table", "lamp"]
+    dataset = pickle.loads(pickle.dumps(PairDataset([replace(files, scene=name) for name in scenes], gt_scale=3)))
     batches = [[pair.name for pair in batch] for batch in DataLoader(dataset, batch_size=2, collate_fn=list)]
-    assert batches == [["chair", "chair"], ["chair"]]
+    assert batches == [["chair", "table"], ["lamp"]]

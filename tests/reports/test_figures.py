@@ -169,6 +169,7 @@ def test_panels_have_the_aspect_of_the_image_and_legends_fit(size: tuple[int, in
     for axes in figure.axes:
         box = axes.get_window_extent()
         assert box.height / box.width == pytest.approx(size[0] / size[1], rel=1e-6)
+        np.testing.assert_allclose(axes.get_position(original=True), axes.get_position(), atol=1e-6)  # no blank strip
     for legend in figure.legends:
         box = legend.get_window_extent()
         assert box.x0 >= 0

@@ -6,6 +6,8 @@ export TENSOR_STEREO_DATA ?= $(abspath ../shared/data)
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# One worker per core, one thread each.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto
 
 .DEFAULT_GOAL := help
 .PHONY: help dev demo test check format lint types imports slow notebooks hooks clean
@@ -24,7 +26,7 @@ demo: $(READY)  ## Classify the embedded synthetic set with all detectors; table
 	$(BIN)/tensor-stereo demo --out $(OUT)/demo
 
 test: $(READY)  ## Run the default suite
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 check: format lint types imports test slow  ## All that CI runs
 
@@ -41,7 +43,7 @@ imports: $(READY)  ## Check the import rules of the package
 	$(BIN)/lint-imports --no-logo --no-cache
 
 slow: $(READY)  ## Run the tests marked slow, cluster, browser or notebook
-	$(BIN)/python -m pytest -m 'slow or cluster or browser or notebook'
+	$(PYTEST) -m 'slow or cluster or browser or notebook'
 
 hooks: $(READY)  ## Install the git hooks
 	$(BIN)/pre-commit install

@@ -123,13 +123,12 @@ class SyntheticConfig:
 
     width_px: int = 400
     height_px: int = 300
-    min_disparity_px: float = 6.0  # of the background, roughly
-    max_disparity_px: float = 60.0  # of the nearest surface, roughly
-    num_poles: int = 4
+    min_disparity_px: float = 6.0  # of what is farthest, about
+    max_disparity_px: float = 60.0  # of what is nearest, about
     noise_levels: float = 2.0  # standard deviation of the sensor noise, in grey levels, independent in both views
     gain: float = 0.97  # of view 1
-    offset_levels: float = 2.0  # of view 1
-    samples_per_px: int = 2  # along each axis
+    offset_levels: float = 2.0  # of view 1, in grey levels
+    samples_per_px: int = 2  # rays along each axis of a pixel
 
     def __post_init__(self) -> None:
         for name in ("width_px", "height_px", "samples_per_px"):
@@ -138,5 +137,7 @@ class SyntheticConfig:
         if not 0 < self.min_disparity_px < self.max_disparity_px:
             limits = f"{self.min_disparity_px} and {self.max_disparity_px}"
             raise ValueError(f"min_disparity_px must lie between 0 and max_disparity_px, got {limits}")
-        if self.noise_levels < 0:
+        if not self.noise_levels >= 0:
             raise ValueError(f"noise_levels must not be negative, got {self.noise_levels}")
+        if not self.gain > 0:
+            raise ValueError(f"gain must be positive, got {self.gain}")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -80,7 +81,8 @@ def match_indices(features0: Features, features1: Features, config: MatchingConf
     2. A keypoint of view 0 takes its candidate of lowest cost, of equal ones that of the lowest index.
     3. ``max_ratio`` r (Lowe, IJCV 60(2), 2004, section 7.1) keeps it iff the distance, the root of the cost, is at
        most r times that of the second-best candidate. Without a second candidate, or with both distances zero, there
-       is no evidence and no match, as in ``kornia.feature.match_snn``.
+       is no evidence and no match, as in ``kornia.feature.match_snn`` (with gates of 1 row and 128 px, 55 % of SIFT's
+       lone candidates in the paper's scenes are correct, against 79 % of those that pass at 0.8).
     4. ``mutual`` keeps it iff view 1's keypoint has no cheaper candidate, and no equal one of a lower index.
     5. Of the matches that share a keypoint of view 1 the cheapest stays, of equal ones that of the lowest index.
 
@@ -111,6 +113,7 @@ def match_indices(features0: Features, features1: Features, config: MatchingConf
     """
     config = config or MatchingConfig()
     check_config(config)
+    features0, features1 = (replace(f, descriptors=f.descriptors.float()) for f in (features0, features1))
     peak = _check_features(features0, features1)
     best = _Best.empty(features0, features1, ratio=config.max_ratio is not None, mutual=config.mutual)
     if any(_is_gate(g) for g in (config.max_row_offset_px, config.min_disparity_px, config.max_disparity_px)):
@@ -195,7 +198,8 @@ class _Best:
         keep = self.nearest != _NONE
         if self.second is not None and max_ratio is not None:
             second, _ = _unpack(self.second)
-            keep &= (self.second != _NONE) & (second > 0) & (cost.double() <= max_ratio**2 * second.double())
+            # the key of no candidate unpacks to NaN, which fails both comparisons
+            keep &= (second > 0) & (cost.double() <= max_ratio**2 * second.double())
         index0 = keep.nonzero()[:, 0]
         index1, cost = index1[index0], cost[index0]
         key1 = _pack(cost, index0)
@@ -218,7 +222,7 @@ def _unpack(key: Tensor) -> tuple[Tensor, Tensor]:
 
 def _ssd(features0: Features, features1: Features, index0: Tensor, index1: Tensor) -> Tensor:
     """(K,) float32 costs of candidates. Each row is summed on its own, whatever its neighbours."""
-    descriptors0, descriptors1 = features0.descriptors.float(), features1.descriptors.float()
+    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     cost = descriptors0.new_empty(len(index0))
     step = max(1, _CHUNK_VALUES // max(1, descriptors0.shape[1]))
     for start in range(0, len(index0), step):
@@ -247,6 +251,11 @@ def gated_candidates(
 
     Raises:
         ValueError: if a keypoint is not finite or beyond 2**24 px.
+
+    >>> points = torch.tensor([[9.0, 4.0], [5.0, 6.0]])
+    >>> features = Features(points, torch.tensor([0, 2]), torch.zeros(2, 1), torch.zeros(2))
+    >>> list(gated_candidates(features, features, MatchingConfig(max_row_offset_px=1)))
+    [(tensor([0, 1]), tensor([0, 1]))]
     """
     x0, y0 = _coordinates("features0", features0)
     x1, y1 = _coordinates("features1", features1)
@@ -318,13 +327,11 @@ def _search_dense(features0: Features, features1: Features, best: _Best, peak: f
     whole = all(bool((f.descriptors == f.descriptors.round()).all()) for f in (features0, features1))
     exact = whole and peak <= 256 and 2 * size * peak**2 <= 2**24  # TF32 and bfloat16 hold whole numbers up to 256
     search = _search_exact if exact else _search_rounded
-    starts1 = features1.ptr.tolist()
-    for b, (start, stop) in enumerate(zip(features0.ptr.tolist()[:-1], features0.ptr.tolist()[1:], strict=True)):
-        num_columns = starts1[b + 1] - starts1[b]
-        if num_columns:
-            for row in range(start, stop, max(1, _CHUNK_DENSE // num_columns)):
-                rows = slice(row, min(row + max(1, _CHUNK_DENSE // num_columns), stop))
-                search(features0, features1, rows, slice(starts1[b], starts1[b + 1]), best)
+    bounds0, bounds1 = (pairwise(f.ptr.tolist()) for f in (features0, features1))
+    for (start, stop), (first, last) in zip(bounds0, bounds1, strict=True):
+        step = max(1, _CHUNK_DENSE // max(1, last - first))
+        for row in range(start, stop if first < last else start, step):
+            search(features0, features1, slice(row, min(row + step, stop)), slice(first, last), best)
 
 
 def _expand(descriptors0: Tensor, descriptors1: Tensor) -> Tensor:
@@ -335,7 +342,7 @@ def _expand(descriptors0: Tensor, descriptors1: Tensor) -> Tensor:
 
 def _search_exact(features0: Features, features1: Features, rows: slice, columns: slice, best: _Best) -> None:
     """Whole numbers whose products and sums float32 holds exactly, in any order of summation."""
-    descriptors0, descriptors1 = features0.descriptors[rows].float(), features1.descriptors[columns].float()
+    descriptors0, descriptors1 = features0.descriptors[rows], features1.descriptors[columns]
     ssd = _expand(descriptors0, descriptors1)
     cost, index = match_nn(descriptors0, descriptors1, dm=ssd)
     best.nearest[rows] = _pack(cost[:, 0], index[:, 1] + columns.start)
@@ -352,15 +359,16 @@ def _search_exact(features0: Features, features1: Features, rows: slice, columns
 def _search_rounded(features0: Features, features1: Features, rows: slice, columns: slice, best: _Best) -> None:
     """Any descriptors: float64 finds all that may be nearest, and the costs of those decide.
 
-    A cost is off by at most (D + 2) float32 roundings of itself, the product by at most 2 (D + 4) float64 roundings of
-    (|a| + |b|)**2 (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1).
+    A cost is off by at most (D + 2) float32 roundings of itself, and D times the smallest normal number if squares
+    underflow; the product by at most 2 (D + 4) float64 roundings of (|a| + |b|)**2 (Higham, Accuracy and Stability of
+    Numerical Algorithms, section 3.1).
     """
     descriptors0, descriptors1 = features0.descriptors[rows].double(), features1.descriptors[columns].double()
     ssd = _expand(descriptors0, descriptors1)
     size = descriptors0.shape[1]
     relative = 1 + 4 * (size + 2) * torch.finfo(torch.float32).eps
     norm = sum(float(d.norm(dim=1).max()) for d in (descriptors0, descriptors1))
-    absolute = 8 * (size + 4) * torch.finfo(torch.float64).eps * norm**2 + size * torch.finfo(torch.float32).tiny
+    absolute = 8 * (size + 4) * torch.finfo(torch.float64).eps * norm**2 + 2 * size * torch.finfo(torch.float32).tiny
     bound, index = ssd.min(1, keepdim=True)
     if best.second is not None:
         bound = ssd.scatter(1, index, math.inf).amin(1, keepdim=True)

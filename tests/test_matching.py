@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -97,7 +96,7 @@ configs = st.builds(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=200)
 @given(
     counts=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=4),
     config=configs,
@@ -117,9 +116,9 @@ def test_matches_are_those_of_the_definition(
     assert found.cost.dtype == torch.float32
 
 
-@pytest.mark.parametrize("ratio", [None, 0.98])
+@pytest.mark.parametrize("ratio", [None, 0.99])
 @pytest.mark.parametrize("mutual", [False, True])
-@pytest.mark.parametrize(("levels", "size"), [(6, 3), (256, 121), (0, 128), (0, 1)])
+@pytest.mark.parametrize(("levels", "size"), [(6, 3), (256, 121), (256, 900), (5000, 64), (0, 128), (0, 1)])
 def test_dense_search_equals_the_gated_one_bit_for_bit(
     levels: int, size: int, mutual: bool, ratio: float | None
 ) -> None:
@@ -313,14 +312,6 @@ def test_matches_do_not_depend_on_the_order_of_keypoints(gate: dict[str, float])
     assert len(found) > 5
 
 
-@given(config=configs, seed=st.integers(0, 2**16))
-def test_matches_are_one_to_one_and_ordered(config: MatchingConfig, seed: int) -> None:
-    views = [make_features(np.random.default_rng(seed + v), [30]) for v in range(2)]
-    found = match_indices(*views, config)
-    assert len(found.index1.unique()) == len(found.index1)
-    assert all(a < b for a, b in pairwise(found.index0.tolist()))
-
-
 def test_equal_costs_go_to_the_lowest_index() -> None:
     for gate in ({}, WIDE):
         found = match_indices(scalar_features([3.0, 3.0]), scalar_features([3.0, 3.0]), MatchingConfig(**gate))
@@ -348,8 +339,11 @@ def test_matches_carry_keypoints_and_their_gradient_but_no_gradient_of_cost() ->
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float64])
 def test_other_descriptor_dtypes_give_the_costs_of_float32(dtype: torch.dtype) -> None:
     generator = np.random.default_rng(13)
-    views = [make_features(generator, [20], levels=256) for _ in range(2)]
-    cast = [replace(v, descriptors=v.descriptors.to(dtype)) for v in views]
+    whole = dtype == torch.uint8
+    cast = [make_features(generator, [40], levels=256 if whole else 0) for _ in range(2)]
+    cast = [replace(v, descriptors=v.descriptors.to(dtype) / (1 if whole else 3)) for v in cast]
+    cast = [replace(v, descriptors=v.descriptors.to(dtype)) for v in cast]
+    views = [replace(v, descriptors=v.descriptors.float()) for v in cast]
     for config in (MatchingConfig(), MatchingConfig(mutual=True, max_ratio=0.9), MatchingConfig(**WIDE)):
         assert same(match_indices(*cast, config), match_indices(*views, config))
 

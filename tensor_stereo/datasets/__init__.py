@@ -20,11 +20,14 @@ if TYPE_CHECKING:
     from .pairs import read_pair as read_pair
     from .pfm import read_pfm as read_pfm
     from .pfm import write_pfm as write_pfm
+    from .synthetic import SyntheticDataset as SyntheticDataset
+    from .synthetic import render_pair as render_pair
 
 _MODULES = {
     "Calibration": "calibration",
     "PairDataset": "pairs",
     "PairFiles": "files",
+    "SyntheticDataset": "synthetic",
     "find_eth3d": "eth3d",
     "find_kitti": "kitti",
     "find_middlebury": "middlebury",
@@ -35,6 +38,7 @@ _MODULES = {
     "read_occlusion_mask": "images",
     "read_pair": "pairs",
     "read_pfm": "pfm",
+    "render_pair": "synthetic",
     "write_pfm": "pfm",
 }
 

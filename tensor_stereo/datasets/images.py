@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .files import StrPath, check_gt_scale
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # mask0nocc.png of MiddEval3 and ETH3D
 UNKNOWN, OCCLUDED, VISIBLE = 0, 128, 255
@@ -120,9 +123,12 @@ def _decode_grey(path: StrPath) -> NDArray[Any]:
 def _decode(path: StrPath) -> NDArray[Any]:
     """(H, W) or (H, W, C) stored values, channels as BGR or BGRA."""
     # imread answers None to a missing and to a damaged file alike, and takes only ASCII paths on some systems
-    encoded = np.frombuffer(Path(path).read_bytes(), dtype=np.uint8)
-    if encoded.size == 0:
+    content = Path(path).read_bytes()
+    if not content:
         raise ValueError(f"{path} is empty (0 bytes), expected an image")
+    if content.startswith(PNG_SIGNATURE) and not _is_whole_png(content):
+        raise ValueError(f"{path} cannot be decoded as an image: the PNG file is truncated or damaged")
+    encoded = np.frombuffer(content, dtype=np.uint8)
     try:
         pixels: NDArray[Any] | None = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -130,3 +136,20 @@ def _decode(path: StrPath) -> NDArray[Any]:
     if pixels is None:
         raise ValueError(f"{path} cannot be decoded as an image: the format is unknown or the file is damaged")
     return pixels
+
+
+def _is_whole_png(content: bytes) -> bool:
+    """Whether all chunks are there and match their checksums; libpng would print its own complaint otherwise.
+
+    Source: PNG specification, 3rd edition, section 5.3.
+    """
+    start = len(PNG_SIGNATURE)
+    while start + 12 <= len(content):
+        length = int.from_bytes(content[start : start + 4])
+        stop = start + 8 + length
+        if zlib.crc32(memoryview(content)[start + 4 : stop]) != int.from_bytes(content[stop : stop + 4]):
+            return False
+        if content[start + 4 : start + 8] == b"IEND":
+            return True
+        start = stop + 4
+    return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tensor_stereo.configs import DETECTORS, PipelineConfig
 
@@ -26,6 +26,8 @@ _HOMES = {
     "extract_windows": "windows",
     "to_gray": "images",
 }
+
+__all__ = ["detect_features", *_HOMES]
 
 
 def detect_features(images: Tensor, config: PipelineConfig | None = None) -> Features:
@@ -51,12 +53,16 @@ def detect_features(images: Tensor, config: PipelineConfig | None = None) -> Fea
     config = config or PipelineConfig()
     if config.detector not in DETECTORS:
         raise ValueError(f"PipelineConfig.detector must be one of {', '.join(DETECTORS)}, got {config.detector!r}")
-    detect = __getattr__(f"detect_{config.detector}")
+    detect = getattr(import_module(f"{__name__}.{config.detector}"), f"detect_{config.detector}")
     features: Features = detect(images, getattr(config, config.detector))
     return features
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+def __getattr__(name: str) -> object:
+    if name in _HOMES:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

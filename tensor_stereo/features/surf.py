@@ -70,8 +70,7 @@ def _detect(image: Tensor, config: SURFConfig) -> tuple[Tensor, Tensor, Tensor]:
         config.threshold,
         is_integral=True,
     )  # (N, 5): y, x, scale, score, sign of the Laplacian
-    if len(points):
-        points = refine_maxima(integral, points, num_octaves=config.num_octaves, initial_step_px=config.initial_step_px)
+    points = refine_maxima(integral, points, num_octaves=config.num_octaves, initial_step_px=config.initial_step_px)
     described = mahotas_surf.descriptors(integral, points, is_integral=True)  # (N', 6 + 64), fewer at the border
     rows = torch.from_numpy(described).to(torch.float32)
     keypoints, scores = rows[:, [1, 0]], rows[:, 3]
@@ -94,6 +93,9 @@ def refine_maxima(integral: Array, points: Array, *, num_octaves: int, initial_s
     Returns:
         (N, 5) the points with new y, x and scale. An offset is clipped to half a step; it is zero where the quadratic
         is flat.
+
+    >>> refine_maxima(np.zeros((9, 9)), np.zeros((0, 5)), num_octaves=4, initial_step_px=1).shape
+    (0, 5)
     """
     octaves = np.arange(num_octaves)
     step = initial_step_px * 2**octaves  # px
@@ -112,15 +114,15 @@ def refine_maxima(integral: Array, points: Array, *, num_octaves: int, initial_s
     cube = hessian_determinant(
         integral, rows[:, None, :, None], columns[:, None, None, :], scales[:, :, None, None]
     )  # (K, 3, 3, 3): scale, y, x
-    largest = cube.max((1, 2, 3)) <= cube[:, 1, 1, 1] * (1 + _ROUNDING)
     offset = _quadratic_maximum(cube).clip(-0.5, 0.5)
 
-    order = np.lexsort((octave, ~largest, point))
-    order = order[np.unique(point[order], return_index=True)[1]]  # the first of each point
+    largest = np.flatnonzero(cube.max((1, 2, 3)) <= cube[:, 1, 1, 1] * (1 + _ROUNDING))  # by point, then octave
+    moved, finest = np.unique(point[largest], return_index=True)
+    finest = largest[finest]
     refined = points.copy()
-    refined[point[order], 0] = (y + step * offset[:, 1])[order]
-    refined[point[order], 1] = (x + step * offset[:, 2])[order]
-    refined[point[order], 2] = _SCALE_PER_LOBE * (lobe + growth * offset[:, 0])[order]
+    refined[moved, 0] = (y + step * offset[:, 1])[finest]
+    refined[moved, 1] = (x + step * offset[:, 2])[finest]
+    refined[moved, 2] = _SCALE_PER_LOBE * (lobe + growth * offset[:, 0])[finest]
     return refined
 
 
@@ -149,6 +151,12 @@ def hessian_determinant(integral: Array, y: Indices, x: Indices, lobe: Indices) 
         y: rows, of any shape that broadcasts with ``x`` and ``lobe``.
         x: columns.
         lobe: side of a lobe in px, odd; the filter has side 3 ``lobe``.
+
+    >>> image = np.zeros((31, 31))
+    >>> image[14:17, 14:17] = 1
+    >>> centre, lobe = np.array([15]), np.array([3])
+    >>> hessian_determinant(image.cumsum(0).cumsum(1), centre, centre, lobe).round(3).tolist()
+    [0.049]
     """
 
     def box(dy: Indices | int, dx: Indices | int, height: Indices, width: Indices) -> Array:

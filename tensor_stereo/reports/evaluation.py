@@ -39,7 +39,7 @@ def write_evaluation(
         out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.
 
     Returns:
-        Tables 1-4 for the detectors of ``config``, Table 5, the run-time by stage, the putative and the isolated matches.
+        Tables 1-4 for the detectors of ``config``, Table 5, run-time by stage, putative matches and isolated ones.
 
     Raises:
         ValueError: if ``out`` holds the results of other settings.

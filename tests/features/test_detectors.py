@@ -19,7 +19,7 @@ CASES = {
     "fast-all": (detect_fast, FASTConfig(nonmax_suppression=False, window_px=5), 25),
     "gftt-kornia": (detect_gftt, GFTTConfig(), 121),
     "gftt-opencv": (detect_gftt, GFTTConfig(backend="opencv", window_px=7), 49),
-    "sift-kornia": (detect_sift, SIFTConfig(max_keypoints=150), 128),
+    "sift-kornia": (detect_sift, SIFTConfig(max_keypoints=60), 128),
     "sift-opencv": (detect_sift, SIFTConfig(backend="opencv"), 128),
     "sift-opencv-upright": (detect_sift, SIFTConfig(backend="opencv", upright=True), 128),
     "surf": (detect_surf, SURFConfig(), 64),

@@ -34,7 +34,8 @@ def maxima(image: Tensor, config: GFTTConfig) -> list[tuple[int, int]]:
     "config",
     [
         GFTTConfig(),
-        GFTTConfig(quality_level=0.2, max_keypoints=25),
+        GFTTConfig(quality_level=0.3),
+        GFTTConfig(max_keypoints=25),
         GFTTConfig(min_distance_px=0),
         GFTTConfig(min_distance_px=8),
     ],

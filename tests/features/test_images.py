@@ -29,6 +29,12 @@ def test_colour_agrees_with_opencv_to_one_level() -> None:
     assert np.abs(gray[0, 0].numpy().astype(int) - expected).max() <= 1
 
 
+def test_luma_is_rounded_to_the_nearest_level() -> None:
+    colour = torch.from_numpy(np.random.default_rng(2).integers(0, 256, (1, 3, 40, 50)).astype(np.uint8))
+    exact = (colour.double() * torch.tensor([0.299, 0.587, 0.114]).double().view(3, 1, 1)).sum(1, keepdim=True)
+    assert (to_gray(colour) - exact).abs().max() <= 0.5 + 1e-4
+
+
 def test_float_colour_equals_uint8_colour() -> None:
     colour = torch.from_numpy(np.random.default_rng(1).integers(0, 256, (2, 3, 20, 30)).astype(np.uint8))
     difference = to_gray(colour).int() - to_gray(colour.double() / 255).int()

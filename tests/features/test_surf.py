@@ -53,6 +53,25 @@ def test_refined_points_stay_in_their_grid_cell_and_keep_their_score(textures: T
     assert not np.array_equal(refined[:, :2], points[:, :2])
 
 
+def test_point_of_the_second_octave_is_refined_on_its_own_grid() -> None:
+    view = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(300, 340)), (0, 0), 3)
+    integral = mahotas_surf.integral((view - view.min()) / np.ptp(view) * 255)
+    first = {tuple(p) for p in mahotas_surf.interest_points(integral, nr_octaves=1, is_integral=True)}
+    both = mahotas_surf.interest_points(integral, nr_octaves=2, is_integral=True)
+    points = np.array([p for p in both if tuple(p) not in first])
+    # lobes of 9, 13, ... px belong to both octaves, so the score alone does not tell them apart
+    y, x = (np.rint(points[:, k, None] / 2).astype(np.int64) * 2 for k in (0, 1))
+    lobe = np.rint((points[:, 2, None] / 0.4 - 1) / 4).astype(np.int64) * 4 + 1
+    scales, rows, columns = (shift.ravel() for shift in np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"))
+    finer = hessian_determinant(integral, y + rows, x + columns, lobe + 2 * scales)  # (N, 27) around the same place
+    coarse_only = finer.max(1) > finer[:, 13] * (1 + 1e-9)
+    assert coarse_only.sum() > 5
+    alone = refine_maxima(integral, points, num_octaves=1, initial_step_px=1)
+    refined = refine_maxima(integral, points, num_octaves=2, initial_step_px=1)
+    assert np.array_equal(alone[coarse_only], points[coarse_only])
+    assert (refined[coarse_only] != points[coarse_only]).any(1).all()
+
+
 def test_point_that_is_no_grid_maximum_stays_as_it_is(textures: Tensor) -> None:
     integral, points = integral_and_points(textures[1, 0])
     points = points[:3].copy()

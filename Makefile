@@ -17,7 +17,7 @@ help:  ## Show this list
 
 dev: $(READY)  ## Build the environment in .venv (a torch that is there already stays)
 
-$(READY): pyproject.toml $(CONSTRAINTS)
+$(READY): pyproject.toml $(CONSTRAINTS) $(wildcard kernels/*.* kernels/*/*.* kernels/*/*/*.*)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --editable '.[dev,notebooks]'
 	touch $@

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from tensor_stereo.batching import from_padded
 from tensor_stereo.configs import Backend, Restriction
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.relations import is_inlier, relate, row_overlap
+from tensor_stereo.relations import is_inlier, relate, shared_neighbors
 from tensor_stereo.types import Classification, Matches
 
 
@@ -51,11 +51,15 @@ def classify_matches(
         tensor(True)
     """
     graphs = build_match_graphs(matches, tie_tolerance=tie_tolerance, backend=backend)
-    return classify_graphs(graphs, restriction=restriction, min_group_size=min_group_size)
+    return classify_graphs(graphs, restriction=restriction, min_group_size=min_group_size, backend=backend)
 
 
 def classify_graphs(
-    graphs: MatchGraphs, *, restriction: Restriction = "cardinality", min_group_size: int = 4
+    graphs: MatchGraphs,
+    *,
+    restriction: Restriction = "cardinality",
+    min_group_size: int = 4,
+    backend: Backend = "auto",
 ) -> Classification:
     """The set tests of :func:`classify_matches` on graphs that exist already.
 
@@ -67,8 +71,7 @@ def classify_graphs(
     """
     if min_group_size < 1:
         raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
-    degree0, degree1 = graphs.adjacency0.degree, graphs.adjacency1.degree
-    overlap = row_overlap(graphs.adjacency0, graphs.adjacency1)
+    overlap, degree0, degree1 = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=backend)
     # An empty neighbour set is a subset of anything: evidence only where there is nobody else.
     has_evidence = ((degree0 > 0) & (degree1 > 0)) | (graphs.group_size == 1)
     tested = (graphs.group_size >= min_group_size) & has_evidence

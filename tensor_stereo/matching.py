@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -12,16 +11,14 @@ import torch
 from kornia.feature import match_nn
 from torch import Tensor
 
-from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import MatchingConfig
+from tensor_stereo.ops import gated_ssd
+from tensor_stereo.ops.gated_ssd import open_gates
+from tensor_stereo.ops.reference import NONE, pack, unpack
+from tensor_stereo.ops.reference import ssd as ssd_of
 from tensor_stereo.types import Features, Matches
 
-_NONE = torch.iinfo(torch.int64).max  # key of "no candidate", larger than that of any candidate
-_INDEX_BITS = 32
-_CHUNK_VALUES = 2**17  # descriptor values that are compared at a time: 512 kB, which stay in the cache
-_CHUNK_CANDIDATES = 2**18  # candidate pairs that are listed at a time
 _CHUNK_DENSE = 2**20  # entries of a dense SSD matrix that are formed at a time
-_MAX_COORDINATE_PX = 2**24
 _MAX_DESCRIPTOR = 2**50  # keeps the SSD finite
 
 
@@ -117,8 +114,7 @@ def match_indices(features0: Features, features1: Features, config: MatchingConf
     peak = _check_features(features0, features1)
     best = _Best.empty(features0, features1, ratio=config.max_ratio is not None, mutual=config.mutual)
     if any(_is_gate(g) for g in (config.max_row_offset_px, config.min_disparity_px, config.max_disparity_px)):
-        for index0, index1 in gated_candidates(features0, features1, config):
-            best.update(index0, index1, _ssd(features0, features1, index0, index1))
+        best.take(*_gated_search(features0, features1, config))
     else:
         _search_dense(features0, features1, best, peak)
     index0, index1, cost = best.select(config.max_ratio)
@@ -159,16 +155,23 @@ def _check_features(features0: Features, features1: Features) -> float:
     return max(peaks)
 
 
+def _gated_search(features0: Features, features1: Features, config: MatchingConfig) -> tuple[Tensor, ...]:
+    arguments = ((f.keypoints, f.descriptors, f.ptr) for f in (features0, features1))
+    (keypoints0, descriptors0, ptr0), (keypoints1, descriptors1, ptr1) = arguments
+    gates = open_gates(config)
+    found: tuple[Tensor, ...] = gated_ssd(
+        keypoints0, keypoints1, descriptors0, descriptors1, ptr0, ptr1, *gates, "auto"
+    )
+    return found
+
+
 def _is_gate(bound: float | None) -> bool:
     return bound is not None and math.isfinite(bound)
 
 
 @dataclass
 class _Best:
-    """Running minima over candidates. A key holds the bits of a cost above an index, so that it orders by both.
-
-    The bits of non-negative floats order as the floats do.
-    """
+    """Running minima over candidates, as keys that order by cost and index."""
 
     nearest: Tensor  # (N0,) key (cost, index1) of the best candidate
     second: Tensor | None  # (N0,) key of the second best
@@ -178,147 +181,46 @@ class _Best:
     @classmethod
     def empty(cls, features0: Features, features1: Features, *, ratio: bool, mutual: bool) -> _Best:
         nearest, nearest1 = (
-            torch.full((len(f.keypoints),), _NONE, device=f.keypoints.device) for f in (features0, features1)
+            torch.full((len(f.keypoints),), NONE, device=f.keypoints.device) for f in (features0, features1)
         )
         return cls(nearest, nearest.clone() if ratio else None, nearest1 if mutual else None, len(nearest1))
 
     def update(self, index0: Tensor, index1: Tensor, cost: Tensor) -> None:
         """Take in candidates. All those of one keypoint of view 0 must come in the same call."""
-        key = _pack(cost, index1)
+        key = pack(cost, index1)
         self.nearest.scatter_reduce_(0, index0, key, "amin")
         if self.second is not None:
-            others = torch.where(key == self.nearest[index0], _NONE, key)
+            others = torch.where(key == self.nearest[index0], NONE, key)
             self.second.scatter_reduce_(0, index0, others, "amin")
         if self.nearest1 is not None:
-            self.nearest1.scatter_reduce_(0, index1, _pack(cost, index0), "amin")
+            self.nearest1.scatter_reduce_(0, index1, pack(cost, index0), "amin")
+
+    def take(self, cost: Tensor, index1: Tensor, second_cost: Tensor, cost1: Tensor, index0: Tensor) -> None:
+        """Take over what :func:`tensor_stereo.ops.gated_ssd` has found."""
+        self.nearest = torch.where(index1 < 0, NONE, pack(cost, index1))
+        if self.second is not None:
+            self.second = torch.where(second_cost.isinf(), NONE, pack(second_cost, torch.zeros_like(index1)))
+        if self.nearest1 is not None:
+            self.nearest1 = torch.where(index0 < 0, NONE, pack(cost1, index0))
 
     def select(self, max_ratio: float | None) -> tuple[Tensor, Tensor, Tensor]:
         """index0, index1 and cost of the matches that pass the tests and stay one-to-one."""
-        cost, index1 = _unpack(self.nearest)
-        keep = self.nearest != _NONE
+        cost, index1 = unpack(self.nearest)
+        keep = self.nearest != NONE
         if self.second is not None and max_ratio is not None:
-            second, _ = _unpack(self.second)
+            second, _ = unpack(self.second)
             # the key of no candidate unpacks to NaN, which fails both comparisons
             keep &= (second > 0) & (cost.double() <= max_ratio**2 * second.double())
         index0 = keep.nonzero()[:, 0]
         index1, cost = index1[index0], cost[index0]
-        key1 = _pack(cost, index0)
+        key1 = pack(cost, index0)
         if self.nearest1 is not None:
             keep = self.nearest1[index1] == key1
         else:
-            cheapest = torch.full((self.num_keypoints1,), _NONE, device=key1.device)
+            cheapest = torch.full((self.num_keypoints1,), NONE, device=key1.device)
             cheapest.scatter_reduce_(0, index1, key1, "amin")
             keep = cheapest[index1] == key1
         return index0[keep], index1[keep], cost[keep]
-
-
-def _pack(cost: Tensor, index: Tensor) -> Tensor:
-    return cost.view(torch.int32).to(torch.int64) << _INDEX_BITS | index
-
-
-def _unpack(key: Tensor) -> tuple[Tensor, Tensor]:
-    return (key >> _INDEX_BITS).to(torch.int32).view(torch.float32), key & (2**_INDEX_BITS - 1)
-
-
-def _ssd(features0: Features, features1: Features, index0: Tensor, index1: Tensor) -> Tensor:
-    """(K,) float32 costs of candidates. Each row is summed on its own, whatever its neighbours."""
-    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
-    cost = descriptors0.new_empty(len(index0))
-    step = max(1, _CHUNK_VALUES // max(1, descriptors0.shape[1]))
-    for start in range(0, len(index0), step):
-        rows = slice(start, start + step)
-        difference = descriptors0.index_select(0, index0[rows]).sub_(descriptors1.index_select(0, index1[rows]))
-        torch.sum(difference.square_(), 1, out=cost[rows])
-    return cost
-
-
-def gated_candidates(
-    features0: Features, features1: Features, config: MatchingConfig
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """List the pairs of keypoints inside the gates, in blocks of bounded size.
-
-    Cells are one pixel wide and max(1, ``max_row_offset_px``) high. Sorted by (pair, cell row, cell column), the
-    cells of one row that a gate touches are one run, found by binary search; a gate touches at most four rows.
-
-    Args:
-        features0: view 0 of B pairs.
-        features1: view 1.
-        config: gates; infinity and None leave a side open.
-
-    Yields:
-        (K,) int64 rows of ``features0`` and of ``features1``, by increasing row of ``features0``. All candidates of one
-        keypoint come in the same block.
-
-    Raises:
-        ValueError: if a keypoint is not finite or beyond 2**24 px.
-
-    >>> points = torch.tensor([[9.0, 4.0], [5.0, 6.0]])
-    >>> features = Features(points, torch.tensor([0, 2]), torch.zeros(2, 1), torch.zeros(2))
-    >>> list(gated_candidates(features, features, MatchingConfig(max_row_offset_px=1)))
-    [(tensor([0, 1]), tensor([0, 1]))]
-    """
-    x0, y0 = _coordinates("features0", features0)
-    x1, y1 = _coordinates("features1", features1)
-    if len(x0) == 0 or len(x1) == 0:
-        return
-    offset = config.max_row_offset_px
-    if offset is None or math.isinf(offset):
-        y0, y1, offset = torch.zeros_like(y0), torch.zeros_like(y1), 0.0  # all in one row
-    low = -math.inf if config.min_disparity_px is None else config.min_disparity_px
-    high = math.inf if config.max_disparity_px is None else config.max_disparity_px
-    top, bottom, left, right = y0 - offset, y0 + offset, x0 - high, x0 - low
-
-    height = max(1.0, offset)
-    row1, first_row0, last_row0 = ((y / height).floor() for y in (y1, top, bottom))
-    column1 = x1.floor()
-    first_row, first_column = row1.min(), column1.min()
-    num_rows, num_columns = (int(v.max() - v.min()) + 1 for v in (row1, column1))
-
-    def cell(batch: Tensor, row: Tensor, column: Tensor) -> Tensor:
-        return (batch * num_rows + row) * num_columns + column
-
-    key1 = cell(ptr_to_batch(features1.ptr), (row1 - first_row).long(), (column1 - first_column).long())
-    key1, order1 = key1.sort(stable=True)
-
-    reach = int(2 * offset / height) + 2  # rows of cells that a gate can touch, at most
-    rows = first_row0[:, None] + torch.arange(reach, device=top.device)  # (N0, reach)
-    touched = (rows <= last_row0[:, None]) & (rows >= first_row) & (rows < first_row + num_rows)
-    rows = rows - first_row
-    batch0, rows = ptr_to_batch(features0.ptr)[:, None], rows.clamp(0, num_rows - 1).long()
-    begin, end = (
-        torch.searchsorted(key1, cell(batch0, rows, bound.clamp(0, num_columns).long()[:, None]))
-        for bound in (left.floor() - first_column, right.floor() + 1 - first_column)
-    )
-    count = torch.where(touched, end - begin, 0)  # (N0, reach)
-
-    for start, stop in _blocks(count.sum(1)):
-        length = count[start:stop].flatten()
-        run = torch.repeat_interleave(length)
-        position = torch.arange(len(run), device=run.device) - (length.cumsum(0) - length)[run]
-        index1 = order1[begin[start:stop].flatten()[run] + position]
-        index0 = start + run // reach
-        y, x = y1[index1], x1[index1]
-        inside = (y >= top[index0]) & (y <= bottom[index0]) & (x >= left[index0]) & (x <= right[index0])
-        yield index0[inside], index1[inside]
-
-
-def _coordinates(name: str, features: Features) -> tuple[Tensor, Tensor]:
-    """Columns and rows of the keypoints in float64, where their differences are exact."""
-    keypoints = features.keypoints.detach().double()
-    if not bool((keypoints.abs() <= _MAX_COORDINATE_PX).all()):
-        raise ValueError(f"keypoints of {name} must be finite and at most {_MAX_COORDINATE_PX} px with gates")
-    x, y = keypoints.unbind(1)
-    return x, y
-
-
-def _blocks(counts: Tensor) -> Iterator[tuple[int, int]]:
-    """Ranges of rows that own up to ``_CHUNK_CANDIDATES`` candidates, and those of one row more."""
-    block = (counts.cumsum(0) - counts) // _CHUNK_CANDIDATES
-    sizes = torch.unique_consecutive(block, return_counts=True)[1]
-    stop = 0
-    for size in sizes.tolist():
-        start, stop = stop, stop + size
-        yield start, stop
 
 
 def _search_dense(features0: Features, features1: Features, best: _Best, peak: float) -> None:
@@ -345,15 +247,15 @@ def _search_exact(features0: Features, features1: Features, rows: slice, columns
     descriptors0, descriptors1 = features0.descriptors[rows], features1.descriptors[columns]
     ssd = _expand(descriptors0, descriptors1)
     cost, index = match_nn(descriptors0, descriptors1, dm=ssd)
-    best.nearest[rows] = _pack(cost[:, 0], index[:, 1] + columns.start)
+    best.nearest[rows] = pack(cost[:, 0], index[:, 1] + columns.start)
     if best.nearest1 is not None:
         cost, index = match_nn(descriptors1, descriptors0, dm=ssd.T)
-        key1 = _pack(cost[:, 0], index[:, 1] + rows.start)
+        key1 = pack(cost[:, 0], index[:, 1] + rows.start)
         best.nearest1[columns] = torch.minimum(best.nearest1[columns], key1)
     if best.second is not None and ssd.shape[1] > 1:
-        index = best.nearest[rows, None] & (2**_INDEX_BITS - 1)
+        index = best.nearest[rows, None] & (2**32 - 1)
         cost = ssd.scatter_(1, index - columns.start, math.inf).amin(1)
-        best.second[rows] = _pack(cost, torch.zeros_like(index[:, 0]))
+        best.second[rows] = pack(cost, torch.zeros_like(index[:, 0]))
 
 
 def _search_rounded(features0: Features, features1: Features, rows: slice, columns: slice, best: _Best) -> None:
@@ -377,4 +279,4 @@ def _search_rounded(features0: Features, features1: Features, rows: slice, colum
         candidates |= ssd <= ssd.amin(0) * relative + absolute
     index0, index1 = candidates.nonzero().unbind(1)
     index0, index1 = index0 + rows.start, index1 + columns.start
-    best.update(index0, index1, _ssd(features0, features1, index0, index1))
+    best.update(index0, index1, ssd_of(features0.descriptors, features1.descriptors, index0, index1))

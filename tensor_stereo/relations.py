@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from tensor_stereo.configs import Restriction
+from tensor_stereo import ops
+from tensor_stereo.configs import Backend, Restriction
 from tensor_stereo.types import Adjacency, Relation
 
 
-def row_overlap(adjacency0: Adjacency, adjacency1: Adjacency) -> Tensor:
-    """Row sums of A0 AND A1: how many neighbours of each node both graphs share.
+class NeighborCounts(NamedTuple):
+    """Sizes of the neighbour sets of every node, (M,) int64 each."""
 
-    torch has no arithmetic on sparse boolean tensors; the AND is a merge of the sorted keys row * M + column.
+    overlap: Tensor  # neighbours in both graphs
+    degree0: Tensor
+    degree1: Tensor
+
+
+def shared_neighbors(adjacency0: Adjacency, adjacency1: Adjacency, *, backend: Backend = "auto") -> NeighborCounts:
+    """Row sums of A0 AND A1, and of both: how many neighbours each node has, and how many both graphs share.
 
     Args:
         adjacency0: pattern over M nodes.
         adjacency1: pattern over the same nodes.
+        backend: as in :func:`tensor_stereo.build_graphs`.
 
     Returns:
-        (M,) int64. No gradient.
+        overlap, degree0 and degree1, (M,) int64. No gradient.
 
     Raises:
         ValueError: if the two patterns differ in size.
@@ -29,22 +39,14 @@ def row_overlap(adjacency0: Adjacency, adjacency1: Adjacency) -> Tensor:
         >>> ptr = torch.tensor([0, 3])
         >>> triangle = build_graphs(torch.tensor([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]]), ptr)
         >>> path = build_graphs(torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), ptr)
-        >>> row_overlap(triangle, path)
+        >>> shared_neighbors(triangle, path).overlap
         tensor([1, 2, 1])
     """
     if adjacency0.num_nodes != adjacency1.num_nodes:
         sizes = f"{adjacency0.num_nodes} and {adjacency1.num_nodes}"
         raise ValueError(f"adjacency0 and adjacency1 must have the same nodes, got {sizes}")
-    keys0, keys1 = _keys(adjacency0), _keys(adjacency1)
-    if not len(keys0) or not len(keys1):
-        return torch.zeros_like(adjacency0.degree)
-    position = torch.searchsorted(keys1, keys0).clamp_(max=len(keys1) - 1)
-    shared = torch.nn.functional.pad((keys1[position] == keys0).cumsum(0), (1, 0))  # (nnz0 + 1,)
-    return shared[adjacency0.crow_indices].diff()
-
-
-def _keys(adjacency: Adjacency) -> Tensor:
-    return adjacency.row_indices * adjacency.num_nodes + adjacency.col_indices
+    (crow0, cols0), (crow1, cols1) = ((a.crow_indices, a.col_indices) for a in (adjacency0, adjacency1))
+    return NeighborCounts(*ops.row_overlap(crow0, cols0, crow1, cols1, backend))
 
 
 def relate(overlap: Tensor, degree0: Tensor, degree1: Tensor, tested: Tensor) -> Tensor:

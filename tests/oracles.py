@@ -6,6 +6,9 @@ from fractions import Fraction
 
 import numpy as np
 
+from tensor_stereo.configs import Backend
+from tensor_stereo.ops.backends import kernels
+
 
 def circle_graph(points: np.ndarray) -> set[tuple[int, int]]:
     """Edges {i, j} for which some circle through both leaves all other points strictly outside.
@@ -60,3 +63,8 @@ def relation_of_sets(n0: set[int], n1: set[int]) -> str:
     if n1 < n0:
         return "SUPERSET"
     return "CONFLICT"
+
+
+def installed_backends() -> list[Backend]:
+    """Back ends that can run here."""
+    return ["scipy"] if kernels is None else ["native", "scipy"]

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tensor_stereo.graphs import build_graphs, build_match_graphs, resolve_backend
+from tensor_stereo.graphs import build_graphs, build_match_graphs
+from tensor_stereo.ops import resolve_backend
 from tensor_stereo.types import Matches
 from tests.oracles import circle_graph, edge_set, neighbor_sets
 from tests.point_sets import distinct_points

@@ -15,7 +15,9 @@ from torch import Tensor
 from tensor_stereo import matching
 from tensor_stereo.batching import concatenate_features
 from tensor_stereo.configs import MatchingConfig
-from tensor_stereo.matching import MatchIndices, gated_candidates, match_features, match_indices
+from tensor_stereo.matching import MatchIndices, match_features, match_indices
+from tensor_stereo.ops import reference
+from tensor_stereo.ops.reference import gated_candidates
 from tensor_stereo.types import Features
 
 WIDE = {"max_row_offset_px": 1e6}  # a gate that lets everything through: the ragged search instead of the dense one
@@ -262,8 +264,10 @@ def test_memory_limits_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         for gate in ({}, {"max_row_offset_px": 2.0, "min_disparity_px": 0.0})
     ]
     expected = [match_indices(*pair, config) for pair, config in cases]
-    for name, value in (("_CHUNK_VALUES", 7), ("_CHUNK_CANDIDATES", 11), ("_CHUNK_DENSE", 64)):
-        monkeypatch.setattr(matching, name, value)
+    monkeypatch.setattr(matching, "_CHUNK_DENSE", 64)
+    monkeypatch.setattr(reference, "_CHUNK_VALUES", 7)
+    monkeypatch.setattr(reference, "_CHUNK_CANDIDATES", 11)
+    monkeypatch.setenv("TENSOR_STEREO_BACKEND", "scipy")
     blocks = list(gated_candidates(*views, MatchingConfig(max_row_offset_px=2)))
     assert len(blocks) > 5
     assert max(len(index0) for index0, _ in blocks) <= 11 + 30

@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.relations import is_inlier, relate, row_overlap
+from tensor_stereo.configs import Backend
+from tensor_stereo.relations import is_inlier, relate, shared_neighbors
 from tensor_stereo.types import Adjacency, Relation
-from tests.oracles import relation_of_sets
+from tests.oracles import installed_backends, relation_of_sets
 
 edge_lists = st.sets(st.tuples(st.integers(0, 6), st.integers(0, 6)).filter(lambda e: e[0] < e[1]))
 
@@ -20,10 +21,10 @@ def _adjacency(edges: set[tuple[int, int]], num_nodes: int = 7) -> Adjacency:
     return Adjacency(lengths_to_ptr(dense.sum(1)), dense.nonzero()[:, 1], torch.tensor([0, num_nodes]))
 
 
-@given(edge_lists, edge_lists)
-def test_relations_are_those_of_sets_and_of_matrices(edges0: set, edges1: set) -> None:
+@given(edge_lists, edge_lists, st.sampled_from(installed_backends()))
+def test_relations_are_those_of_sets_and_of_matrices(edges0: set, edges1: set, backend: Backend) -> None:
     a0, a1 = _adjacency(edges0), _adjacency(edges1)
-    overlap = row_overlap(a0, a1)
+    overlap = shared_neighbors(a0, a1, backend=backend).overlap
     dense0, dense1 = a0.to_dense(0), a1.to_dense(0)
     assert torch.equal(overlap, (dense0 & dense1).sum(1))
     product = a0.to_sparse_csr(torch.int64) * a1.to_sparse_csr(torch.int64)
@@ -39,8 +40,8 @@ def test_relations_are_those_of_sets_and_of_matrices(edges0: set, edges1: set) -
 def test_exchanging_the_views_exchanges_subset_and_superset(edges0: set, edges1: set) -> None:
     a0, a1 = _adjacency(edges0), _adjacency(edges1)
     tested = torch.ones(7, dtype=torch.bool)
-    forth = relate(row_overlap(a0, a1), a0.degree, a1.degree, tested)
-    back = relate(row_overlap(a1, a0), a1.degree, a0.degree, tested)
+    forth = relate(shared_neighbors(a0, a1).overlap, a0.degree, a1.degree, tested)
+    back = relate(shared_neighbors(a1, a0).overlap, a1.degree, a0.degree, tested)
     exchanged = {Relation.SUBSET: Relation.SUPERSET, Relation.SUPERSET: Relation.SUBSET}
     assert [exchanged.get(Relation(r), Relation(r)) for r in forth.tolist()] == back.tolist()
 
@@ -61,6 +62,6 @@ def test_adjacency_verdict_implies_cardinality_verdict() -> None:
 
 def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match="adjacency0 and adjacency1"):
-        row_overlap(_adjacency(set()), _adjacency(set(), 3))
+        shared_neighbors(_adjacency(set()), _adjacency(set(), 3))
     with pytest.raises(ValueError, match="restriction"):
         is_inlier(torch.arange(5), "cardinal")  # type: ignore[arg-type]

@@ -1,0 +1,164 @@
+// The only file that knows Python. Shapes are checked here; values are the business of the callers in tensor_stereo/ops.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <memory>
+#include <optional>
+#include <stdexcept>
+#include <tuple>
+
+#include "tensor_stereo/delaunay_graph.hpp"
+#include "tensor_stereo/gated_ssd.hpp"
+#include "tensor_stereo/one_to_one.hpp"
+#include "tensor_stereo/predicates.hpp"
+#include "tensor_stereo/row_overlap.hpp"
+
+namespace nb = nanobind;
+namespace ts = tensor_stereo;
+
+namespace {
+
+template <class T, class... Shape>
+using Input = nb::ndarray<const T, Shape..., nb::c_contig, nb::device::cpu>;
+using Points = Input<double, nb::shape<-1, 2>>;
+using Matrix = Input<float, nb::ndim<2>>;
+using Integers = Input<std::int64_t, nb::ndim<1>>;
+using Doubles = Input<double, nb::ndim<1>>;
+template <class T>
+using Output = nb::ndarray<nb::numpy, T, nb::ndim<1>>;
+
+template <class T>
+Output<T> give(std::unique_ptr<T[]> values, std::size_t size) {
+    T* const data = values.release();
+    nb::capsule owner(data, [](void* memory) noexcept { delete[] static_cast<T*>(memory); });
+    return Output<T>(data, {size}, owner);
+}
+
+template <class T>
+std::unique_ptr<T[]> allocate(std::size_t size) {
+    return std::unique_ptr<T[]>(new T[size]);
+}
+
+void check(bool condition, const char* message) {
+    if (!condition) throw std::invalid_argument(message);
+}
+
+void check_offsets(const Integers& ptr, std::int64_t total, const char* message) {
+    const std::size_t size = ptr.shape(0);
+    check(size >= 1 && ptr.data()[0] == 0 && ptr.data()[size - 1] == total, message);
+    for (std::size_t k = 1; k < size; ++k) check(ptr.data()[k - 1] <= ptr.data()[k], message);
+}
+
+auto delaunay_graph(Points points, Integers index, Integers ptr, double tie_tolerance, int num_threads) {
+    const auto num_points = static_cast<std::int64_t>(points.shape(0));
+    check_offsets(ptr, static_cast<std::int64_t>(index.shape(0)), "ptr must rise from 0 to the length of index");
+    for (std::size_t k = 0; k < index.shape(0); ++k) {
+        check(index.data()[k] >= 0 && index.data()[k] < num_points, "index must name rows of points");
+    }
+    ts::SparsePattern graph;
+    {
+        const nb::gil_scoped_release release;
+        graph = ts::delaunay_graph(points.data(), num_points, index.data(), ptr.data(),
+                                   static_cast<std::int64_t>(ptr.shape(0)) - 1, tie_tolerance, num_threads);
+    }
+    const auto num_entries = static_cast<std::size_t>(graph.crow[num_points]);
+    return std::tuple(give(std::move(graph.crow), num_points + 1), give(std::move(graph.cols), num_entries));
+}
+
+auto row_overlap(Integers crow0, Integers cols0, Integers crow1, Integers cols1, int num_threads) {
+    check(crow0.shape(0) == crow1.shape(0), "crow0 and crow1 must have the same length");
+    check_offsets(crow0, static_cast<std::int64_t>(cols0.shape(0)), "crow0 must rise from 0 to the length of cols0");
+    check_offsets(crow1, static_cast<std::int64_t>(cols1.shape(0)), "crow1 must rise from 0 to the length of cols1");
+    const std::size_t num_rows = crow0.shape(0) - 1;
+    auto overlap = allocate<std::int64_t>(num_rows), degree0 = allocate<std::int64_t>(num_rows),
+         degree1 = allocate<std::int64_t>(num_rows);
+    {
+        const nb::gil_scoped_release release;
+        ts::row_overlap(crow0.data(), cols0.data(), crow1.data(), cols1.data(), static_cast<std::int64_t>(num_rows),
+                        num_threads, overlap.get(), degree0.get(), degree1.get());
+    }
+    return std::tuple(give(std::move(overlap), num_rows), give(std::move(degree0), num_rows),
+                      give(std::move(degree1), num_rows));
+}
+
+auto one_to_one(Points points0, Points points1, Integers ptr, std::optional<Doubles> cost, int num_threads) {
+    const std::size_t num_matches = points0.shape(0);
+    check(points1.shape(0) == num_matches, "points0 and points1 must have the same length");
+    check(!cost || cost->shape(0) == num_matches, "cost must have one entry per match");
+    check_offsets(ptr, static_cast<std::int64_t>(num_matches), "ptr must rise from 0 to the number of matches");
+    auto kept = allocate<bool>(num_matches);
+    {
+        const nb::gil_scoped_release release;
+        ts::one_to_one(points0.data(), points1.data(), ptr.data(), static_cast<std::int64_t>(ptr.shape(0)) - 1,
+                       cost ? cost->data() : nullptr, num_threads, kept.get());
+    }
+    return give(std::move(kept), num_matches);
+}
+
+std::int64_t first_point_out_of_range(Points points) {
+    const nb::gil_scoped_release release;
+    return ts::first_point_out_of_range(points.data(), static_cast<std::int64_t>(points.shape(0)));
+}
+
+auto gated_ssd(Points keypoints0, Points keypoints1, Matrix descriptors0, Matrix descriptors1, Integers ptr0,
+               Integers ptr1, double row_offset, double min_disparity, double max_disparity, int num_threads) {
+    const std::size_t num0 = keypoints0.shape(0), num1 = keypoints1.shape(0);
+    check(descriptors0.shape(0) == num0 && descriptors1.shape(0) == num1, "descriptors must have one row per keypoint");
+    check(descriptors0.shape(1) == descriptors1.shape(1), "descriptors of both views must have one length");
+    check(ptr0.shape(0) == ptr1.shape(0), "ptr0 and ptr1 must have the same length");
+    check_offsets(ptr0, static_cast<std::int64_t>(num0), "ptr0 must rise from 0 to the number of keypoints");
+    check_offsets(ptr1, static_cast<std::int64_t>(num1), "ptr1 must rise from 0 to the number of keypoints");
+    auto cost = allocate<float>(num0), second_cost = allocate<float>(num0), cost1 = allocate<float>(num1);
+    auto index = allocate<std::int64_t>(num0), index1 = allocate<std::int64_t>(num1);
+    {
+        const nb::gil_scoped_release release;
+        ts::gated_ssd({keypoints0.data(), descriptors0.data(), ptr0.data()},
+                      {keypoints1.data(), descriptors1.data(), ptr1.data()},
+                      static_cast<std::int64_t>(ptr0.shape(0)) - 1, static_cast<std::int64_t>(descriptors0.shape(1)),
+                      {row_offset, min_disparity, max_disparity}, num_threads,
+                      {cost.get(), index.get(), second_cost.get(), cost1.get(), index1.get()});
+    }
+    return std::tuple(give(std::move(cost), num0), give(std::move(index), num0), give(std::move(second_cost), num0),
+                      give(std::move(cost1), num1), give(std::move(index1), num1));
+}
+
+ts::Point point(const Points& points, std::size_t k) { return {points.data()[2 * k], points.data()[2 * k + 1]}; }
+
+auto orientation(Points a, Points b, Points c) {
+    const std::size_t count = a.shape(0);
+    check(b.shape(0) == count && c.shape(0) == count, "a, b and c must have the same length");
+    auto signs = allocate<std::int8_t>(count);
+    for (std::size_t k = 0; k < count; ++k) {
+        signs[k] = static_cast<std::int8_t>(ts::exact_orientation(point(a, k), point(b, k), point(c, k)));
+    }
+    return give(std::move(signs), count);
+}
+
+auto incircle(Points a, Points b, Points c, Points d) {
+    const std::size_t count = a.shape(0);
+    check(b.shape(0) == count && c.shape(0) == count && d.shape(0) == count, "a, b, c and d must have the same length");
+    auto signs = allocate<std::int8_t>(count);
+    for (std::size_t k = 0; k < count; ++k) {
+        signs[k] = static_cast<std::int8_t>(ts::exact_incircle(point(a, k), point(b, k), point(c, k), point(d, k)));
+    }
+    return give(std::move(signs), count);
+}
+
+}  // namespace
+
+NB_MODULE(_kernels, module) {
+    module.def("delaunay_graph", &delaunay_graph, nb::arg("points"), nb::arg("index"), nb::arg("ptr"),
+               nb::arg("tie_tolerance"), nb::arg("num_threads"));
+    module.def("row_overlap", &row_overlap, nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
+               nb::arg("num_threads"));
+    module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),
+               nb::arg("cost").none(), nb::arg("num_threads"));
+    module.def("first_point_out_of_range", &first_point_out_of_range, nb::arg("points"));
+    module.def("gated_ssd", &gated_ssd, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("descriptors0"),
+               nb::arg("descriptors1"), nb::arg("ptr0"), nb::arg("ptr1"), nb::arg("row_offset"),
+               nb::arg("min_disparity"), nb::arg("max_disparity"), nb::arg("num_threads"));
+    module.def("orientation", &orientation, nb::arg("a"), nb::arg("b"), nb::arg("c"));
+    module.def("incircle", &incircle, nb::arg("a"), nb::arg("b"), nb::arg("c"), nb::arg("d"));
+}

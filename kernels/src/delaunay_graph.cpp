@@ -1,0 +1,262 @@
+#include "tensor_stereo/delaunay_graph.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <vector>
+
+#include "tensor_stereo/parallel.hpp"
+#include "tensor_stereo/triangulation.hpp"
+
+namespace tensor_stereo {
+namespace {
+
+// Which edges of a triangulation belong to the graph.
+class GraphEdges {
+   public:
+    explicit GraphEdges(double tie_tolerance)
+        : tolerance_(tie_tolerance),
+          bound_(1 / tie_tolerance),
+          // Below this sine of an angle, roughly, rounding could make a dual length of zero pass for one of e.
+          condition_(16 * kEpsilon * (bound_ + 1) / tie_tolerance) {}
+
+    // Calls keep(h) for one half-edge of each edge of the graph.
+    template <class Keep>
+    void select(const Triangulation& mesh, const Keep& keep) {
+        const auto half_edges = static_cast<Index>(mesh.origin.size());
+        if (tolerance_ == 0) {
+            for (Index h = 0; h < half_edges; ++h) {
+                if (mesh.twin[h] < h && side(mesh, h) < 0) keep(h);
+            }
+            return;
+        }
+        measure(mesh);
+        bool any_tie = false;
+        state_.resize(half_edges);
+        for (Index h = 0; h < half_edges; ++h) {
+            const Index t = mesh.twin[h];
+            if (t > h) continue;
+            const bool is_long = ends_[h] + (t == kNone ? bound_ : ends_[t]) > tolerance_;
+            State state = is_long ? kLong : kShort;
+            // A short dual edge may be a tie; a long one with a needle beside it must prove that it is none.
+            if (t != kNone && (!is_long || is_needle_[h / 3] || is_needle_[t / 3])) {
+                if (side(mesh, h) == 0) {
+                    state = kTie;
+                    any_tie = true;
+                }
+            }
+            state_[h] = state;
+        }
+        if (any_tie) settle_ties(mesh);
+        for (Index h = 0; h < half_edges; ++h) {
+            if (mesh.twin[h] < h && state_[h] == kLong) keep(h);
+        }
+    }
+
+   private:
+    enum State : std::uint8_t { kShort, kLong, kTie };
+
+    // In-circle sign of the vertex opposite to the twin, -1 on the hull.
+    static int side(const Triangulation& mesh, Index h) noexcept {
+        const Index t = mesh.twin[h];
+        if (t == kNone) return -1;
+        const Point* p = mesh.points.data();
+        const Index* o = mesh.origin.data();
+        const Point a = p[o[h]], b = p[o[next_in_triangle(h)]], c = p[o[previous_in_triangle(h)]];
+        const Point d = p[o[previous_in_triangle(t)]];
+        return incircle(a, b, c, d, mesh.bounds);
+    }
+
+    // Signed distance of the circle's centre from the midpoint of {i, j} towards k, in edge lengths: cot(angle at k) / 2.
+    double end_of_dual(double dot, double cross) const noexcept {
+        return std::min(std::max(0.5 * dot / std::fabs(cross), -bound_), bound_);
+    }
+
+    double end_of_dual(Point i, Point j, Point k) const noexcept {
+        const double vx = i.x - k.x, vy = i.y - k.y, wx = j.x - k.x, wy = j.y - k.y;
+        return end_of_dual(vx * wx + vy * wy, vx * wy - vy * wx);
+    }
+
+    // The ends of the dual edges of all half-edges, and the triangles in which rounding is felt.
+    void measure(const Triangulation& mesh) {
+        const std::size_t num_triangles = mesh.origin.size() / 3;
+        ends_.resize(3 * num_triangles);
+        is_needle_.resize(num_triangles);
+        for (std::size_t t = 0; t < num_triangles; ++t) {
+            const Point a = mesh.points[mesh.origin[3 * t]], b = mesh.points[mesh.origin[3 * t + 1]],
+                        c = mesh.points[mesh.origin[3 * t + 2]];
+            // Negation does not round, so three differences serve the three corners.
+            const double px = a.x - c.x, py = a.y - c.y, qx = b.x - c.x, qy = b.y - c.y, rx = a.x - b.x, ry = a.y - b.y;
+            const double pq0 = px * qy, pq1 = py * qx, pr0 = px * ry, pr1 = py * rx, qr0 = qx * ry, qr1 = qy * rx;
+            const double cross_c = std::fabs(pq0 - pq1), cross_a = std::fabs(pr0 - pr1), cross_b = std::fabs(qr0 - qr1);
+            ends_[3 * t] = end_of_dual(px * qx + py * qy, cross_c);
+            ends_[3 * t + 1] = end_of_dual(px * rx + py * ry, cross_a);
+            ends_[3 * t + 2] = end_of_dual(-(qx * rx + qy * ry), cross_b);
+            is_needle_[t] = !(cross_c > condition_ * (std::fabs(pq0) + std::fabs(pq1)) &&
+                              cross_a > condition_ * (std::fabs(pr0) + std::fabs(pr1)) &&
+                              cross_b > condition_ * (std::fabs(qr0) + std::fabs(qr1)));
+        }
+    }
+
+    // A co-circular polygon may be cut in many ways, and its vertices give the same circle but for rounding. So that the
+    // result depends on the points alone, its edges are measured from its lexicographically first vertex not on them.
+    void settle_ties(const Triangulation& mesh) {
+        const auto half_edges = static_cast<Index>(mesh.origin.size());
+        polygon_.resize(half_edges / 3);
+        std::iota(polygon_.begin(), polygon_.end(), 0);
+        is_tied_.assign(half_edges / 3, false);
+        tied_.clear();
+        for (Index h = 0; h < half_edges; ++h) {
+            if (mesh.twin[h] == kNone || mesh.twin[h] > h || state_[h] != kTie) continue;
+            for (const Index t : {h / 3, mesh.twin[h] / 3}) {
+                if (!is_tied_[t]) tied_.push_back(t);
+                is_tied_[t] = true;
+            }
+            polygon_[root(h / 3)] = root(mesh.twin[h] / 3);
+        }
+        const Point* points = mesh.points.data();
+        first_.resize(half_edges / 3);
+        for (const Index t : tied_) first_[t].fill(kNone);
+        for (const Index t : tied_) {
+            auto& first = first_[root(t)];
+            for (Index h = 3 * t; h < 3 * t + 3; ++h) {  // insert into the three first
+                Index v = mesh.origin[h];
+                for (Index& slot : first) {
+                    if (slot == v) break;
+                    if (slot == kNone || is_before(points[v], points[slot])) std::swap(slot, v);
+                    if (v == kNone) break;
+                }
+            }
+        }
+        for (const Index t : tied_) {
+            const auto& first = first_[root(t)];
+            for (Index h = 3 * t; h < 3 * t + 3; ++h) {
+                const Index i = mesh.origin[h], j = mesh.origin[next_in_triangle(h)];
+                const Index* chosen = first.data();
+                while (*chosen == i || *chosen == j) ++chosen;
+                ends_[h] = end_of_dual(points[i], points[j], points[*chosen]);
+            }
+        }
+        for (const Index t : tied_) {
+            for (Index h = 3 * t; h < 3 * t + 3; ++h) {
+                const Index twin = mesh.twin[h];
+                auto& state = state_[std::max(h, twin)];
+                if (state == kTie) continue;
+                const bool is_long = ends_[h] + (twin == kNone ? bound_ : ends_[twin]) > tolerance_;
+                state = is_long ? kLong : kShort;
+            }
+        }
+    }
+
+    Index root(Index t) noexcept {
+        while (polygon_[t] != t) t = polygon_[t] = polygon_[polygon_[t]];
+        return t;
+    }
+
+    static bool is_before(Point p, Point q) noexcept { return p.x < q.x || (p.x == q.x && p.y < q.y); }
+
+    double tolerance_, bound_, condition_;
+    std::vector<double> ends_;
+    std::vector<std::uint8_t> is_needle_;
+    std::vector<State> state_;
+    std::vector<Index> polygon_, tied_;
+    std::vector<bool> is_tied_;
+    std::vector<std::array<Index, 3>> first_;
+};
+
+// Builds one segment after the other and keeps its memory.
+class Builder {
+   public:
+    Builder(const double* points, double tie_tolerance) : points_(points), edges_(tie_tolerance) {}
+
+    // Writes the degrees of the vertices and, one row after the other, their ascending neighbours (at most 6 count).
+    void build(const std::int64_t* index, std::size_t count, Index* degree, Index* neighbors) {
+        pairs_.clear();
+        if (count > 0) collect_edges(index, count);
+        std::fill_n(degree, count, 0);
+        for (const auto& [i, j] : pairs_) ++degree[i], ++degree[j];
+        start_.resize(count + 1);
+        start_[0] = 0;
+        for (std::size_t v = 0; v < count; ++v) start_[v + 1] = start_[v] + degree[v];
+        // The pattern is symmetric: filling the rows in any order and transposing sorts them without a comparison.
+        unsorted_.resize(2 * pairs_.size());
+        position_.assign(start_.begin(), start_.end() - 1);
+        for (const auto& [i, j] : pairs_) {
+            unsorted_[position_[i]++] = j;
+            unsorted_[position_[j]++] = i;
+        }
+        position_.assign(start_.begin(), start_.end() - 1);
+        for (std::size_t v = 0; v < count; ++v) {
+            for (Index k = start_[v]; k < start_[v + 1]; ++k) {
+                neighbors[position_[unsorted_[k]]++] = static_cast<Index>(v);
+            }
+        }
+    }
+
+   private:
+    void collect_edges(const std::int64_t* index, std::size_t count) {
+        triangulate(points_, index, count, mesh_, workspace_);
+        const Index* vertex = mesh_.vertex.data();
+        if (mesh_.is_collinear) {
+            for (std::size_t k = 0; k + 1 < count; ++k) pairs_.push_back({vertex[k], vertex[k + 1]});
+            return;
+        }
+        pairs_.reserve(mesh_.origin.size());
+        edges_.select(mesh_, [&](Index h) {
+            pairs_.push_back({vertex[mesh_.origin[h]], vertex[mesh_.origin[next_in_triangle(h)]]});
+        });
+    }
+
+    struct Pair {
+        Index i, j;
+    };
+
+    const double* points_;
+    GraphEdges edges_;
+    Triangulation mesh_;
+    Workspace workspace_;
+    std::vector<Pair> pairs_;
+    std::vector<Index> start_, position_, unsorted_;
+};
+
+}  // namespace
+
+SparsePattern delaunay_graph(const double* points, std::int64_t num_points, const std::int64_t* index,
+                             const std::int64_t* ptr, std::int64_t num_segments, double tie_tolerance,
+                             int num_threads) {
+    SparsePattern result;
+    result.num_rows = num_points;
+    result.crow.reset(new std::int64_t[num_points + 1]());
+    const std::int64_t num_vertices = ptr[num_segments];
+    std::unique_ptr<Index[]> degree(new Index[num_vertices]);
+    std::unique_ptr<Index[]> neighbors(new Index[6 * num_vertices]);  // a planar graph has fewer than 6 per vertex
+    parallel_for(num_segments, 1, num_threads, [&] {
+        return [&, builder = Builder(points, tie_tolerance)](std::int64_t begin, std::int64_t end) mutable {
+            for (std::int64_t s = begin; s < end; ++s) {
+                const std::int64_t start = ptr[s];
+                const auto count = static_cast<std::size_t>(ptr[s + 1] - start);
+                builder.build(index + start, count, degree.get() + start, neighbors.get() + 6 * start);
+                for (std::size_t v = 0; v < count; ++v) result.crow[index[start + v] + 1] = degree[start + v];
+            }
+        };
+    });
+    for (std::int64_t row = 0; row < num_points; ++row) result.crow[row + 1] += result.crow[row];
+    result.cols.reset(new std::int64_t[result.crow[num_points]]);
+    parallel_for(num_segments, 1, num_threads, [&] {
+        return [&](std::int64_t begin, std::int64_t end) {
+            for (std::int64_t s = begin; s < end; ++s) {
+                const std::int64_t* rows = index + ptr[s];
+                const Index* source = neighbors.get() + 6 * ptr[s];
+                for (std::int64_t v = ptr[s]; v < ptr[s + 1]; ++v) {
+                    std::int64_t* target = result.cols.get() + result.crow[index[v]];
+                    for (Index k = 0; k < degree[v]; ++k) target[k] = rows[*source++];
+                }
+            }
+        };
+    });
+    return result;
+}
+
+}  // namespace tensor_stereo

@@ -1,0 +1,11 @@
+"""Operators of ``torch.library`` under the namespace ``tensor_stereo``, each with a slow reference."""
+
+from tensor_stereo.ops.backends import BackendInfo as BackendInfo
+from tensor_stereo.ops.backends import backend as backend
+from tensor_stereo.ops.backends import resolve_backend as resolve_backend
+from tensor_stereo.ops.delaunay_graph import delaunay_graph as delaunay_graph
+from tensor_stereo.ops.delaunay_graph import match_graphs as match_graphs
+from tensor_stereo.ops.gated_ssd import gated_ssd as gated_ssd
+from tensor_stereo.ops.predicates import incircle as incircle
+from tensor_stereo.ops.predicates import orientation as orientation
+from tensor_stereo.ops.row_overlap import row_overlap as row_overlap

@@ -1,0 +1,61 @@
+"""Which back end runs: the compiled kernels, or scipy and plain torch."""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from types import ModuleType
+from typing import NamedTuple
+
+from tensor_stereo.configs import Backend
+
+try:
+    _loaded = import_module("tensor_stereo._kernels")
+except ImportError as error:
+    kernels: ModuleType | None = None
+    _reason = f"the compiled module tensor_stereo._kernels is missing ({error}); scipy and torch do its work, slower"
+else:
+    kernels = _loaded
+    _reason = "the compiled module tensor_stereo._kernels is installed"
+
+
+class BackendInfo(NamedTuple):
+    """What ``auto`` stands for and why."""
+
+    name: str
+    reason: str
+
+
+def backend() -> BackendInfo:
+    """The back end that ``auto`` stands for in this process, and what is missing if it is not ``native``.
+
+    The environment variable ``TENSOR_STEREO_BACKEND`` (``auto``, ``native`` or ``scipy``) overrides it.
+
+    Raises:
+        ValueError: if that variable names an unknown back end, or ``native`` where it is not installed.
+
+    Example:
+        >>> backend().name in ("native", "scipy")
+        True
+    """
+    wish = os.environ.get("TENSOR_STEREO_BACKEND", "auto")
+    name = resolve_backend("auto")
+    return BackendInfo(name, _reason if wish == "auto" else f"TENSOR_STEREO_BACKEND is {wish!r}")
+
+
+def resolve_backend(backend: Backend) -> Backend:
+    """``native`` or ``scipy`` for any allowed name.
+
+    Raises:
+        ValueError: for an unknown name, or ``native`` where it is not installed.
+    """
+    source = "backend"
+    if backend == "auto":
+        backend, source = os.environ.get("TENSOR_STEREO_BACKEND", "auto"), "TENSOR_STEREO_BACKEND"  # type: ignore[assignment]
+    if backend not in ("auto", "native", "scipy"):
+        raise ValueError(f"{source} must be 'auto', 'native' or 'scipy', got {backend!r}")
+    if backend == "native" and kernels is None:
+        raise ValueError(f"{source} 'native' cannot run: {_reason}")
+    if backend == "auto":
+        return "scipy" if kernels is None else "native"
+    return backend

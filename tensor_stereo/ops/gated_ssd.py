@@ -1,0 +1,109 @@
+"""Operator that finds nearest neighbours by SSD among the keypoints inside a gate."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.configs import MatchingConfig
+from tensor_stereo.ops import reference
+from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.types import Features
+
+
+@torch.library.custom_op("tensor_stereo::gated_ssd", mutates_args=())
+def gated_ssd(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    descriptors0: Tensor,
+    descriptors1: Tensor,
+    ptr0: Tensor,
+    ptr1: Tensor,
+    max_row_offset_px: float,
+    min_disparity_px: float,
+    max_disparity_px: float,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Nearest neighbours by sum of squared differences; of equal costs the lowest index counts.
+
+    Candidates of keypoint i are the keypoints j of the partner image with y1 within y0 +- ``max_row_offset_px`` and x1
+    between x0 - ``max_disparity_px`` and x0 - ``min_disparity_px``, in float64, bounds included.
+
+    Args:
+        keypoints0: (N0, 2) px of view 0, finite.
+        keypoints1: (N1, 2) px of view 1.
+        descriptors0: (N0, D) float32.
+        descriptors1: (N1, D) float32.
+        ptr0: (B + 1,) int64 offsets of the images.
+        ptr1: (B + 1,).
+        max_row_offset_px: infinity opens the gate.
+        min_disparity_px: minus infinity opens it.
+        max_disparity_px: infinity opens it.
+        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+
+    Returns:
+        cost (N0,) float32, index (N0,) int64 rows of view 1, cost of the second-best candidate (N0,) float32, and seen
+        from view 1: cost (N1,), index (N1,). Without a candidate infinity and -1. No gradient.
+
+    Example:
+        >>> points, ptr = torch.tensor([[9.0, 4.0], [5.0, 4.0]]), torch.tensor([0, 2])
+        >>> windows = torch.tensor([[1.0], [7.0]])
+        >>> gated_ssd(points, points - 2, windows, windows, ptr, ptr, 2.0, 0.0, 3.0, "auto")[1]
+        tensor([0, 1])
+    """
+    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+        config = MatchingConfig(
+            max_row_offset_px=max_row_offset_px, min_disparity_px=min_disparity_px, max_disparity_px=max_disparity_px
+        )
+        views = ((keypoints0, ptr0, descriptors0), (keypoints1, ptr1, descriptors1))
+        features0, features1 = (Features(points, ptr, vectors, points[:, 0]) for points, ptr, vectors in views)
+        return reference.gated_ssd(features0, features1, config)  # type: ignore[return-value]
+    reference.check_coordinates("features0", keypoints0)
+    reference.check_coordinates("features1", keypoints1)
+    results = kernels.gated_ssd(
+        *(p.detach().to("cpu", torch.float64).contiguous().numpy() for p in (keypoints0, keypoints1)),
+        *(d.detach().to("cpu", torch.float32).contiguous().numpy() for d in (descriptors0, descriptors1)),
+        *(ptr.numpy(force=True) for ptr in (ptr0, ptr1)),
+        max_row_offset_px,
+        min_disparity_px,
+        max_disparity_px,
+        torch.get_num_threads(),
+    )
+    cost, index, second_cost, cost1, index1 = (torch.from_numpy(values).to(keypoints0.device) for values in results)
+    return cost, index, second_cost, cost1, index1
+
+
+@gated_ssd.register_fake
+def _(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    descriptors0: Tensor,
+    descriptors1: Tensor,
+    ptr0: Tensor,
+    ptr1: Tensor,
+    max_row_offset_px: float,
+    min_disparity_px: float,
+    max_disparity_px: float,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    num0, num1 = keypoints0.shape[0], keypoints1.shape[0]
+    cost = keypoints0.new_empty(num0, dtype=torch.float32)
+    cost1 = keypoints0.new_empty(num1, dtype=torch.float32)
+    index, index1 = (keypoints0.new_empty(n, dtype=torch.int64) for n in (num0, num1))
+    return cost, index, torch.empty_like(cost), cost1, index1
+
+
+def open_gates(config: MatchingConfig) -> tuple[float, float, float]:
+    """Row offset and disparity range in px, with infinities for what is not gated.
+
+    Example:
+        >>> open_gates(MatchingConfig(max_disparity_px=64))
+        (inf, -inf, 64)
+    """
+    return (
+        math.inf if config.max_row_offset_px is None else config.max_row_offset_px,
+        -math.inf if config.min_disparity_px is None else config.min_disparity_px,
+        math.inf if config.max_disparity_px is None else config.max_disparity_px,
+    )

@@ -1,0 +1,44 @@
+"""Operator that intersects the rows of two sparse patterns."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.ops import reference
+from tensor_stereo.ops.backends import kernels, resolve_backend
+
+
+@torch.library.custom_op("tensor_stereo::row_overlap", mutates_args=())
+def row_overlap(
+    crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor, backend: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How many columns the rows of two patterns share, and how many each has.
+
+    Args:
+        crow0: (M + 1,) int64 row offsets.
+        cols0: (nnz0,) int64 columns, ascending within a row.
+        crow1: (M + 1,).
+        cols1: (nnz1,).
+        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+
+    Returns:
+        overlap, degree0 and degree1, (M,) int64. No gradient.
+
+    Example:
+        >>> crow = torch.tensor([0, 2, 3])
+        >>> row_overlap(crow, torch.tensor([0, 1, 1]), crow, torch.tensor([1, 2, 0]), "auto")[0]
+        tensor([1, 0])
+    """
+    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+        return reference.row_overlap(crow0, cols0, crow1, cols1)
+    arrays = (t.numpy(force=True) for t in (crow0, cols0, crow1, cols1))
+    results = kernels.row_overlap(*arrays, torch.get_num_threads())
+    overlap, degree0, degree1 = (torch.from_numpy(values).to(crow0.device) for values in results)
+    return overlap, degree0, degree1
+
+
+@row_overlap.register_fake
+def _(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor]:
+    num_rows = crow0.shape[0] - 1
+    return crow0.new_empty(num_rows), crow0.new_empty(num_rows), crow0.new_empty(num_rows)

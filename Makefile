@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo test check format lint types imports slow notebooks hooks clean
+.PHONY: help dev demo test check format lint types imports slow kernels sanitize fuzz bench hooks clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -28,7 +28,7 @@ demo: $(READY)  ## Classify the embedded synthetic set with all detectors; table
 test: $(READY)  ## Run the default suite
 	$(PYTEST)
 
-check: format lint types imports test slow  ## All that CI runs
+check: format lint types imports test sanitize slow  ## All that CI runs
 
 format: $(READY)  ## Check the formatting
 	$(BIN)/ruff format --check .
@@ -44,6 +44,23 @@ imports: $(READY)  ## Check the import rules of the package
 
 slow: $(READY)  ## Run the tests marked slow, cluster, browser or notebook
 	$(PYTEST) -m 'slow or cluster or browser or notebook'
+
+kernels:  ## Build and run the C++ tests
+	cmake -S kernels -B build/kernels -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON
+	cmake --build build/kernels --parallel
+	build/kernels/test_kernels
+
+sanitize:  ## Build and run the C++ tests with the address and undefined-behaviour sanitizers
+	cmake -S kernels -B build/sanitize -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON \
+	  -DTENSOR_STEREO_SANITIZE=ON -DCMAKE_BUILD_TYPE=RelWithDebInfo
+	cmake --build build/sanitize --parallel
+	build/sanitize/test_kernels
+
+fuzz:  ## Fuzz the graph builder for a minute (needs clang++ with libFuzzer)
+	cmake -S kernels -B build/fuzz -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_FUZZ=ON -DTENSOR_STEREO_SANITIZE=ON \
+	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_COMPILER=clang++
+	cmake --build build/fuzz --parallel
+	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
 
 hooks: $(READY)  ## Install the git hooks
 	$(BIN)/pre-commit install

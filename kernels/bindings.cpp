@@ -83,6 +83,21 @@ auto row_overlap(Integers crow0, Integers cols0, Integers crow1, Integers cols1,
                       give(std::move(degree1), num_rows));
 }
 
+auto relate(Integers overlap, Integers degree0, Integers degree1, Integers group_size, std::int64_t min_group_size,
+            bool accept_subsets) {
+    const std::size_t count = overlap.shape(0);
+    check(degree0.shape(0) == count && degree1.shape(0) == count && group_size.shape(0) == count,
+          "overlap, degree0, degree1 and group_size must have the same length");
+    auto relation = allocate<std::int8_t>(count);
+    auto inlier = allocate<bool>(count);
+    {
+        const nb::gil_scoped_release release;
+        ts::relate(overlap.data(), degree0.data(), degree1.data(), group_size.data(), static_cast<std::int64_t>(count),
+                   min_group_size, accept_subsets, relation.get(), inlier.get());
+    }
+    return std::tuple(give(std::move(relation), count), give(std::move(inlier), count));
+}
+
 auto one_to_one(Points points0, Points points1, Integers ptr, std::optional<Doubles> cost, int num_threads) {
     const std::size_t num_matches = points0.shape(0);
     check(points1.shape(0) == num_matches, "points0 and points1 must have the same length");
@@ -153,6 +168,8 @@ NB_MODULE(_kernels, module) {
                nb::arg("tie_tolerance"), nb::arg("num_threads"));
     module.def("row_overlap", &row_overlap, nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
                nb::arg("num_threads"));
+    module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),
+               nb::arg("min_group_size"), nb::arg("accept_subsets"));
     module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),
                nb::arg("cost").none(), nb::arg("num_threads"));
     module.def("first_point_out_of_range", &first_point_out_of_range, nb::arg("points"));

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from tensor_stereo import ops
 from tensor_stereo.batching import from_padded
 from tensor_stereo.configs import Backend, Restriction
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.relations import is_inlier, relate, shared_neighbors
+from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.types import Classification, Matches
 
 
@@ -71,12 +72,12 @@ def classify_graphs(
     """
     if min_group_size < 1:
         raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
+    accept_subsets = {"adjacency": False, "cardinality": True}.get(restriction)
+    if accept_subsets is None:
+        raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
     overlap, degree0, degree1 = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=backend)
-    # An empty neighbour set is a subset of anything: evidence only where there is nobody else.
-    has_evidence = ((degree0 > 0) & (degree1 > 0)) | (graphs.group_size == 1)
-    tested = (graphs.group_size >= min_group_size) & has_evidence
-    relation = relate(overlap, degree0, degree1, tested)
-    return Classification(is_inlier(relation, restriction), relation, overlap, degree0, degree1)
+    relation, inlier = ops.relate(overlap, degree0, degree1, graphs.group_size, min_group_size, accept_subsets, backend)
+    return Classification(inlier, relation, overlap, degree0, degree1)
 
 
 class FilterOutput(NamedTuple):

@@ -1,15 +1,14 @@
-"""Two adjacencies over the same matches -> overlap, degrees and :class:`Relation` of every match."""
+"""Two adjacencies over the same matches -> the sizes of their neighbour sets."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from tensor_stereo import ops
-from tensor_stereo.configs import Backend, Restriction
-from tensor_stereo.types import Adjacency, Relation
+from tensor_stereo.configs import Backend
+from tensor_stereo.types import Adjacency
 
 
 class NeighborCounts(NamedTuple):
@@ -35,6 +34,7 @@ def shared_neighbors(adjacency0: Adjacency, adjacency1: Adjacency, *, backend: B
         ValueError: if the two patterns differ in size.
 
     Example:
+        >>> import torch
         >>> from tensor_stereo.graphs import build_graphs
         >>> ptr = torch.tensor([0, 3])
         >>> triangle = build_graphs(torch.tensor([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]]), ptr)
@@ -47,56 +47,3 @@ def shared_neighbors(adjacency0: Adjacency, adjacency1: Adjacency, *, backend: B
         raise ValueError(f"adjacency0 and adjacency1 must have the same nodes, got {sizes}")
     (crow0, cols0), (crow1, cols1) = ((a.crow_indices, a.col_indices) for a in (adjacency0, adjacency1))
     return NeighborCounts(*ops.row_overlap(crow0, cols0, crow1, cols1, backend))
-
-
-def relate(overlap: Tensor, degree0: Tensor, degree1: Tensor, tested: Tensor) -> Tensor:
-    """Relation of the two neighbour sets of every match, from their sizes.
-
-    Args:
-        overlap: (M,) |N0 & N1|.
-        degree0: (M,) |N0|.
-        degree1: (M,) |N1|.
-        tested: (M,) bool; False gives UNTESTED.
-
-    Returns:
-        (M,) int8 values of :class:`Relation`.
-
-    Example:
-        >>> one = torch.tensor([1, 1, 2, 1])
-        >>> relate(one, torch.tensor([1, 1, 3, 2]), torch.tensor([1, 2, 2, 3]), torch.tensor([True] * 4)).tolist()
-        [1, 2, 3, 4]
-    """
-    within0, within1 = overlap == degree0, overlap == degree1
-    relation = torch.full_like(overlap, Relation.CONFLICT, dtype=torch.int8)
-    relation[within0] = int(Relation.SUBSET)
-    relation[within1] = int(Relation.SUPERSET)
-    relation[within0 & within1] = int(Relation.EQUAL)
-    relation[~tested] = int(Relation.UNTESTED)
-    return relation
-
-
-def is_inlier(relation: Tensor, restriction: Restriction) -> Tensor:
-    """Verdict of a restriction.
-
-    Args:
-        relation: (M,) values of :class:`Relation`.
-        restriction: ``adjacency`` (Restriction 1) accepts EQUAL; ``cardinality`` (Restriction 2) also SUBSET, SUPERSET.
-
-    Returns:
-        (M,) bool.
-
-    Raises:
-        ValueError: for another restriction.
-
-    Source: Bustos, Vargas & Trujillo, CIARP 2016, section 3.
-
-    Example:
-        >>> is_inlier(torch.tensor([0, 1, 2, 3, 4]), "cardinality").tolist()
-        [False, True, True, True, False]
-    """
-    equal = relation == Relation.EQUAL
-    if restriction == "adjacency":
-        return equal
-    if restriction == "cardinality":
-        return equal | (relation == Relation.SUBSET) | (relation == Relation.SUPERSET)
-    raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")

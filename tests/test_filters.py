@@ -202,6 +202,8 @@ def test_module_names_a_bad_argument() -> None:
 def test_min_group_size_is_checked() -> None:
     with pytest.raises(ValueError, match="min_group_size"):
         classify_matches(random_pair("integer", 0, 5), min_group_size=0)
+    with pytest.raises(ValueError, match="restriction"):
+        classify_matches(random_pair("integer", 0, 5), restriction="cardinal")  # type: ignore[arg-type]
 
 
 def test_split_matches_is_the_inverse_of_collate_matches() -> None:

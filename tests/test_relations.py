@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.configs import Backend
-from tensor_stereo.relations import is_inlier, relate, shared_neighbors
+from tensor_stereo.ops import relate
+from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.types import Adjacency, Relation
 from tests.oracles import installed_backends, relation_of_sets
 
@@ -29,39 +30,39 @@ def test_relations_are_those_of_sets_and_of_matrices(edges0: set, edges1: set, b
     assert torch.equal(overlap, (dense0 & dense1).sum(1))
     product = a0.to_sparse_csr(torch.int64) * a1.to_sparse_csr(torch.int64)
     assert torch.equal(overlap, product.to_dense().sum(1))
-    tested = torch.ones(7, dtype=torch.bool)
-    relation = relate(overlap, a0.degree, a1.degree, tested)
+    size = torch.full((7,), 7)
+    relation, inlier = relate(overlap, a0.degree, a1.degree, size, 1, True, backend)
+    strict = relate(overlap, a0.degree, a1.degree, size, 1, False, backend)[1]
     for node in range(7):
         sets = [{j for e in edges for i, j in (e, e[::-1]) if i == node} for edges in (edges0, edges1)]
-        assert Relation(int(relation[node])).name == relation_of_sets(*sets)
+        expected = relation_of_sets(*sets) if all(sets) else "UNTESTED"
+        assert Relation(int(relation[node])).name == expected
+        assert bool(inlier[node]) == (expected in ("EQUAL", "SUBSET", "SUPERSET"))
+        assert bool(strict[node]) == (expected == "EQUAL")
 
 
-@given(edge_lists, edge_lists)
-def test_exchanging_the_views_exchanges_subset_and_superset(edges0: set, edges1: set) -> None:
-    a0, a1 = _adjacency(edges0), _adjacency(edges1)
-    tested = torch.ones(7, dtype=torch.bool)
-    forth = relate(shared_neighbors(a0, a1).overlap, a0.degree, a1.degree, tested)
-    back = relate(shared_neighbors(a1, a0).overlap, a1.degree, a0.degree, tested)
-    exchanged = {Relation.SUBSET: Relation.SUPERSET, Relation.SUPERSET: Relation.SUBSET}
-    assert [exchanged.get(Relation(r), Relation(r)) for r in forth.tolist()] == back.tolist()
+sizes = st.integers(0, 5)
 
 
-def test_untested_is_never_an_inlier() -> None:
-    one, never = torch.ones(1, dtype=torch.int64), torch.zeros(1, dtype=torch.bool)
-    relation = relate(one, one, one, never)
-    assert relation.tolist() == [Relation.UNTESTED]
-    assert not is_inlier(relation, "adjacency").any()
-    assert not is_inlier(relation, "cardinality").any()
+@given(st.lists(st.tuples(sizes, sizes, sizes, sizes)), st.integers(1, 5), st.booleans())
+def test_every_back_end_relates_alike(rows: list[tuple[int, ...]], min_group_size: int, accept_subsets: bool) -> None:
+    columns = torch.tensor(rows, dtype=torch.int64).reshape(-1, 4).T
+    results = [relate(*columns, min_group_size, accept_subsets, backend) for backend in installed_backends()]
+    for relation, inlier in results:
+        assert torch.equal(relation, results[0][0])
+        assert torch.equal(inlier, results[0][1])
+        assert not inlier[relation == Relation.UNTESTED].any()
+        assert (relation[columns[3] < min_group_size] == Relation.UNTESTED).all()
 
 
-def test_adjacency_verdict_implies_cardinality_verdict() -> None:
-    every = torch.arange(5)
-    assert not (is_inlier(every, "adjacency") & ~is_inlier(every, "cardinality")).any()
-    assert is_inlier(every, "adjacency").tolist() == [False, True, False, False, False]
+@pytest.mark.parametrize("backend", installed_backends())
+def test_operator_keeps_the_rules_of_torch_and_compiles(backend: Backend) -> None:
+    columns = torch.randint(0, 4, (4, 30), generator=torch.Generator().manual_seed(0)).unbind()
+    torch.library.opcheck(torch.ops.tensor_stereo.relate.default, (*columns, 2, True, backend))
+    compiled = torch.compile(lambda: relate(*columns, 2, True, backend)[1].sum(), fullgraph=True, backend="aot_eager")
+    assert int(compiled()) == int(relate(*columns, 2, True, backend)[1].sum())
 
 
 def test_bad_input_is_named() -> None:
     with pytest.raises(ValueError, match="adjacency0 and adjacency1"):
         shared_neighbors(_adjacency(set()), _adjacency(set(), 3))
-    with pytest.raises(ValueError, match="restriction"):
-        is_inlier(torch.arange(5), "cardinal")  # type: ignore[arg-type]

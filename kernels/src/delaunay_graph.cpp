@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <utility>
 #include <vector>
 
 #include "tensor_stereo/parallel.hpp"
@@ -22,36 +23,41 @@ class GraphEdges {
           // Below this sine of an angle, roughly, rounding could make a dual length of zero pass for one of e.
           condition_(16 * kEpsilon * (bound_ + 1) / tie_tolerance) {}
 
-    // Calls keep(h) for one half-edge of each edge of the graph.
+    // Calls keep(i, j) for both directions of each edge of the graph, vertices in the mesh's own order.
     template <class Keep>
     void select(const Triangulation& mesh, const Keep& keep) {
         const auto half_edges = static_cast<Index>(mesh.origin.size());
+        const Index* const twin = mesh.twin.data();
+        state_.assign(half_edges, kLong);
         if (tolerance_ == 0) {
             for (Index h = 0; h < half_edges; ++h) {
-                if (mesh.twin[h] < h && side(mesh, h) < 0) keep(h);
+                if (twin[h] < h && twin[h] != kNone && side(mesh, h) >= 0) state_[h] = state_[twin[h]] = kTie;
             }
-            return;
-        }
-        measure(mesh);
-        bool any_tie = false;
-        state_.resize(half_edges);
-        for (Index h = 0; h < half_edges; ++h) {
-            const Index t = mesh.twin[h];
-            if (t > h) continue;
-            const bool is_long = ends_[h] + (t == kNone ? bound_ : ends_[t]) > tolerance_;
-            State state = is_long ? kLong : kShort;
-            // A short dual edge may be a tie; a long one with a needle beside it must prove that it is none.
-            if (t != kNone && (!is_long || is_needle_[h / 3] || is_needle_[t / 3])) {
-                if (side(mesh, h) == 0) {
-                    state = kTie;
-                    any_tie = true;
+        } else {
+            measure(mesh);
+            bool any_tie = false;
+            for (Index h = 0; h < half_edges; ++h) {
+                const bool is_long = ends_[h] + (twin[h] == kNone ? bound_ : ends_[twin[h]]) > tolerance_;
+                if (is_long && !any_needle_) continue;
+                if (twin[h] == kNone) {
+                    state_[h] = is_long ? kLong : kShort;
+                    continue;
                 }
+                // A short dual edge may be a tie; a long one with a needle beside it must prove that it is none.
+                const bool is_tie = (!is_long || is_needle_[h / 3] || is_needle_[twin[h] / 3]) && side(mesh, h) == 0;
+                state_[h] = is_tie ? kTie : is_long ? kLong : kShort;
+                any_tie |= is_tie;
             }
-            state_[h] = state;
+            if (any_tie) settle_ties(mesh);
         }
-        if (any_tie) settle_ties(mesh);
-        for (Index h = 0; h < half_edges; ++h) {
-            if (mesh.twin[h] < h && state_[h] == kLong) keep(h);
+        for (Index t = 0; t < half_edges; t += 3) {
+            const Index* const v = mesh.origin.data() + t;
+            const std::pair<Index, Index> sides[] = {{v[0], v[1]}, {v[1], v[2]}, {v[2], v[0]}};
+            for (Index k = 0; k < 3; ++k) {
+                if (state_[t + k] != kLong) continue;
+                keep(sides[k].first, sides[k].second);
+                if (twin[t + k] == kNone) keep(sides[k].second, sides[k].first);
+            }
         }
     }
 
@@ -84,6 +90,7 @@ class GraphEdges {
         const std::size_t num_triangles = mesh.origin.size() / 3;
         ends_.resize(3 * num_triangles);
         is_needle_.resize(num_triangles);
+        any_needle_ = false;
         for (std::size_t t = 0; t < num_triangles; ++t) {
             const Point a = mesh.points[mesh.origin[3 * t]], b = mesh.points[mesh.origin[3 * t + 1]],
                         c = mesh.points[mesh.origin[3 * t + 2]];
@@ -97,6 +104,7 @@ class GraphEdges {
             is_needle_[t] = !(cross_c > condition_ * (std::fabs(pq0) + std::fabs(pq1)) &&
                               cross_a > condition_ * (std::fabs(pr0) + std::fabs(pr1)) &&
                               cross_b > condition_ * (std::fabs(qr0) + std::fabs(qr1)));
+            any_needle_ |= is_needle_[t] != 0;
         }
     }
 
@@ -142,10 +150,10 @@ class GraphEdges {
         for (const Index t : tied_) {
             for (Index h = 3 * t; h < 3 * t + 3; ++h) {
                 const Index twin = mesh.twin[h];
-                auto& state = state_[std::max(h, twin)];
-                if (state == kTie) continue;
+                if (state_[h] == kTie) continue;
                 const bool is_long = ends_[h] + (twin == kNone ? bound_ : ends_[twin]) > tolerance_;
-                state = is_long ? kLong : kShort;
+                state_[h] = is_long ? kLong : kShort;
+                if (twin != kNone) state_[twin] = state_[h];
             }
         }
     }
@@ -160,6 +168,7 @@ class GraphEdges {
     double tolerance_, bound_, condition_;
     std::vector<double> ends_;
     std::vector<std::uint8_t> is_needle_;
+    bool any_needle_ = false;
     std::vector<State> state_;
     std::vector<Index> polygon_, tied_;
     std::vector<bool> is_tied_;
@@ -173,20 +182,17 @@ class Builder {
 
     // Writes the degrees of the vertices and, one row after the other, their ascending neighbours (at most 6 count).
     void build(const std::int64_t* index, std::size_t count, Index* degree, Index* neighbors) {
+        std::fill_n(degree, count, 0);
         pairs_.clear();
         if (count > 0) collect_edges(index, count);
-        std::fill_n(degree, count, 0);
-        for (const auto& [i, j] : pairs_) ++degree[i], ++degree[j];
+        for (const Pair& pair : pairs_) ++degree[pair.i];
         start_.resize(count + 1);
         start_[0] = 0;
         for (std::size_t v = 0; v < count; ++v) start_[v + 1] = start_[v] + degree[v];
         // The pattern is symmetric: filling the rows in any order and transposing sorts them without a comparison.
-        unsorted_.resize(2 * pairs_.size());
+        unsorted_.resize(pairs_.size());
         position_.assign(start_.begin(), start_.end() - 1);
-        for (const auto& [i, j] : pairs_) {
-            unsorted_[position_[i]++] = j;
-            unsorted_[position_[j]++] = i;
-        }
+        for (const Pair& pair : pairs_) unsorted_[position_[pair.i]++] = pair.j;
         position_.assign(start_.begin(), start_.end() - 1);
         for (std::size_t v = 0; v < count; ++v) {
             for (Index k = start_[v]; k < start_[v + 1]; ++k) {
@@ -200,13 +206,16 @@ class Builder {
         triangulate(points_, index, count, mesh_, workspace_);
         const Index* vertex = mesh_.vertex.data();
         if (mesh_.is_collinear) {
-            for (std::size_t k = 0; k + 1 < count; ++k) pairs_.push_back({vertex[k], vertex[k + 1]});
+            for (std::size_t k = 0; k + 1 < count; ++k) {
+                pairs_.push_back({vertex[k], vertex[k + 1]});
+                pairs_.push_back({vertex[k + 1], vertex[k]});
+            }
             return;
         }
-        pairs_.reserve(mesh_.origin.size());
-        edges_.select(mesh_, [&](Index h) {
-            pairs_.push_back({vertex[mesh_.origin[h]], vertex[mesh_.origin[next_in_triangle(h)]]});
-        });
+        pairs_.resize(2 * mesh_.origin.size());
+        Pair* end = pairs_.data();
+        edges_.select(mesh_, [&](Index i, Index j) { *end++ = {vertex[i], vertex[j]}; });
+        pairs_.resize(end - pairs_.data());
     }
 
     struct Pair {

@@ -209,6 +209,12 @@ void test_row_overlap_counts_shared_columns() {
         ts::row_overlap(crow0, cols0, crow1, cols1, 3, num_threads, overlap, degree0, degree1);
         EXPECT(overlap[0] == 2 && overlap[1] == 0 && overlap[2] == 0);
         EXPECT(degree0[0] == 3 && degree0[1] == 0 && degree1[1] == 1);
+        const std::int64_t group_size[] = {3, 3, 0};
+        std::int8_t relation[3];
+        bool inlier[3];
+        ts::relate(overlap, degree0, degree1, group_size, 3, 1, true, relation, inlier);
+        EXPECT(relation[0] == ts::kSuperset && relation[1] == ts::kUntested && relation[2] == ts::kUntested);
+        EXPECT(inlier[0] && !inlier[1] && !inlier[2]);
     }
 }
 

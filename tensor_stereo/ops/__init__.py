@@ -8,4 +8,5 @@ from tensor_stereo.ops.delaunay_graph import match_graphs as match_graphs
 from tensor_stereo.ops.gated_ssd import gated_ssd as gated_ssd
 from tensor_stereo.ops.predicates import incircle as incircle
 from tensor_stereo.ops.predicates import orientation as orientation
+from tensor_stereo.ops.relate import relate as relate
 from tensor_stereo.ops.row_overlap import row_overlap as row_overlap

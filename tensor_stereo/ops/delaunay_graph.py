@@ -7,11 +7,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import Backend
 from tensor_stereo.delaunay.edges import delaunay_edges
 from tensor_stereo.duplicates import coincident_ids, first_of_coincident, keep_one_to_one
 from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import check_integer, check_points, check_ptr, check_vector
 
 Float = NDArray[np.float64]
@@ -22,7 +22,31 @@ Pattern = tuple[Tensor, Tensor]  # crow (N + 1,), cols (nnz,)
 SMALLEST, LARGEST = 1e-60, 1e60  # magnitudes whose degree-4 determinants neither underflow nor overflow
 
 
-@torch.library.custom_op("tensor_stereo::delaunay_graph", mutates_args=())
+def _fake_pattern(keypoints: Tensor, ptr: Tensor) -> Pattern:
+    num_entries = torch.library.get_ctx().new_dynamic_size()
+    return ptr.new_empty(keypoints.shape[0] + 1), ptr.new_empty(num_entries)
+
+
+def _fake_graph(
+    keypoints: Tensor, ptr: Tensor, group: Tensor | None, tie_tolerance: float, backend: str
+) -> tuple[Tensor, Tensor]:
+    return _fake_pattern(keypoints, ptr)
+
+
+def _fake_match_graphs(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    ptr: Tensor,
+    cost: Tensor | None,
+    group: Tensor | None,
+    tie_tolerance: float,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    size = ptr.new_empty(keypoints0.shape[0], device=keypoints0.device)
+    return (*_fake_pattern(keypoints0, ptr), *_fake_pattern(keypoints1, ptr), size)
+
+
+@operator(_fake_graph)
 def delaunay_graph(
     keypoints: Tensor, ptr: Tensor, group: Tensor | None, tie_tolerance: float, backend: str
 ) -> tuple[Tensor, Tensor]:
@@ -53,7 +77,7 @@ def delaunay_graph(
     return _build([points], ptr, segment, kept, tie_tolerance, choice)[0]
 
 
-@torch.library.custom_op("tensor_stereo::match_graphs", mutates_args=())
+@operator(_fake_match_graphs)
 def match_graphs(
     keypoints0: Tensor,
     keypoints1: Tensor,
@@ -90,32 +114,6 @@ def match_graphs(
     return crow0, cols0, crow1, cols1, _group_size(ptr, segment, kept).to(keypoints0.device)
 
 
-@delaunay_graph.register_fake
-def _(
-    keypoints: Tensor, ptr: Tensor, group: Tensor | None, tie_tolerance: float, backend: str
-) -> tuple[Tensor, Tensor]:
-    return _fake_pattern(keypoints, ptr)
-
-
-@match_graphs.register_fake
-def _(
-    keypoints0: Tensor,
-    keypoints1: Tensor,
-    ptr: Tensor,
-    cost: Tensor | None,
-    group: Tensor | None,
-    tie_tolerance: float,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    size = ptr.new_empty(keypoints0.shape[0], device=keypoints0.device)
-    return (*_fake_pattern(keypoints0, ptr), *_fake_pattern(keypoints1, ptr), size)
-
-
-def _fake_pattern(keypoints: Tensor, ptr: Tensor) -> Pattern:
-    num_entries = torch.library.get_ctx().new_dynamic_size()
-    return ptr.new_empty(keypoints.shape[0] + 1), ptr.new_empty(num_entries)
-
-
 def segments_of(ptr: Tensor, group: Tensor, num_rows: int) -> Int:
     """(M,) int64 number of the segment, an object group within a pair, of every row."""
     check_vector("group", group, num_rows)
@@ -136,8 +134,8 @@ def _check_options(tie_tolerance: float, backend: str) -> Backend:
 
 
 def _pair(ptr: Tensor) -> Int:
-    pair: Int = ptr_to_batch(ptr).numpy(force=True)
-    return pair
+    length = np.diff(ptr.numpy(force=True))
+    return np.repeat(np.arange(len(length)), length)
 
 
 def _to_points(name: str, keypoints: Tensor, ptr: Tensor) -> Float:
@@ -176,9 +174,10 @@ def _keep_one_to_one(views: list[Float], ptr: Tensor, cost: Tensor | None, backe
 
 
 def _group_size(ptr: Tensor, segment: Int | None, kept: Bool) -> Tensor:
+    # NumPy, because torch would wake its threads for this, and they would spin beside the kernels' own.
     if segment is None and kept.all():
-        length = ptr.diff().cpu()
-        return torch.repeat_interleave(length, length, output_size=len(kept))
+        length = np.diff(ptr.numpy(force=True))
+        return torch.from_numpy(np.repeat(length, length))
     segment = _pair(ptr) if segment is None else segment
     return torch.from_numpy(np.bincount(segment, weights=kept).astype(np.int64)[segment] * kept)
 

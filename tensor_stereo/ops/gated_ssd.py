@@ -10,10 +10,30 @@ from torch import Tensor
 from tensor_stereo.configs import MatchingConfig
 from tensor_stereo.ops import reference
 from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import Features
 
 
-@torch.library.custom_op("tensor_stereo::gated_ssd", mutates_args=())
+def _fake(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    descriptors0: Tensor,
+    descriptors1: Tensor,
+    ptr0: Tensor,
+    ptr1: Tensor,
+    max_row_offset_px: float,
+    min_disparity_px: float,
+    max_disparity_px: float,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    num0, num1 = keypoints0.shape[0], keypoints1.shape[0]
+    cost = keypoints0.new_empty(num0, dtype=torch.float32)
+    cost1 = keypoints0.new_empty(num1, dtype=torch.float32)
+    index, index1 = (keypoints0.new_empty(n, dtype=torch.int64) for n in (num0, num1))
+    return cost, index, torch.empty_like(cost), cost1, index1
+
+
+@operator(_fake)
 def gated_ssd(
     keypoints0: Tensor,
     keypoints1: Tensor,
@@ -73,26 +93,6 @@ def gated_ssd(
     )
     cost, index, second_cost, cost1, index1 = (torch.from_numpy(values).to(keypoints0.device) for values in results)
     return cost, index, second_cost, cost1, index1
-
-
-@gated_ssd.register_fake
-def _(
-    keypoints0: Tensor,
-    keypoints1: Tensor,
-    descriptors0: Tensor,
-    descriptors1: Tensor,
-    ptr0: Tensor,
-    ptr1: Tensor,
-    max_row_offset_px: float,
-    min_disparity_px: float,
-    max_disparity_px: float,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    num0, num1 = keypoints0.shape[0], keypoints1.shape[0]
-    cost = keypoints0.new_empty(num0, dtype=torch.float32)
-    cost1 = keypoints0.new_empty(num1, dtype=torch.float32)
-    index, index1 = (keypoints0.new_empty(n, dtype=torch.int64) for n in (num0, num1))
-    return cost, index, torch.empty_like(cost), cost1, index1
 
 
 def open_gates(config: MatchingConfig) -> tuple[float, float, float]:

@@ -7,10 +7,19 @@ from torch import Tensor
 
 from tensor_stereo.delaunay import predicates
 from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import check_points, check_rows
 
 
-@torch.library.custom_op("tensor_stereo::orientation", mutates_args=())
+def _fake_orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
+    return a.new_empty(a.shape[0], dtype=torch.int8)
+
+
+def _fake_incircle(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor:
+    return a.new_empty(a.shape[0], dtype=torch.int8)
+
+
+@operator(_fake_orientation)
 def orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
     """Exact turn of the path a, b, c; see :func:`tensor_stereo.delaunay.predicates.orientation`.
 
@@ -31,7 +40,7 @@ def orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
     return _signs("orientation", (a, b, c), backend)
 
 
-@torch.library.custom_op("tensor_stereo::incircle", mutates_args=())
+@operator(_fake_incircle)
 def incircle(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor:
     """Exact side of the circle through a, b, c; see :func:`tensor_stereo.delaunay.predicates.incircle`.
 
@@ -51,16 +60,6 @@ def incircle(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor
         tensor([0], dtype=torch.int8)
     """
     return _signs("incircle", (a, b, c, d), backend)
-
-
-@orientation.register_fake
-def _(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
-    return a.new_empty(a.shape[0], dtype=torch.int8)
-
-
-@incircle.register_fake
-def _(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor:
-    return a.new_empty(a.shape[0], dtype=torch.int8)
 
 
 def _signs(name: str, points: tuple[Tensor, ...], backend: str) -> Tensor:

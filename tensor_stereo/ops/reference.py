@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import MatchingConfig
-from tensor_stereo.types import Features
+from tensor_stereo.types import Features, Relation
 
 NONE = torch.iinfo(torch.int64).max  # key of "no candidate", larger than that of any candidate
 _INDEX_BITS = 32
@@ -40,6 +40,22 @@ def row_overlap(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor) -> t
     position = torch.searchsorted(keys1, keys0).clamp_(max=len(keys1) - 1)
     shared = torch.nn.functional.pad((keys1[position] == keys0).cumsum(0), (1, 0))  # (nnz0 + 1,)
     return shared[crow0].diff(), degree0, degree1
+
+
+def relate(
+    overlap: Tensor, degree0: Tensor, degree1: Tensor, group_size: Tensor, min_group_size: int, accept_subsets: bool
+) -> tuple[Tensor, Tensor]:
+    """Relation and verdict from the sizes of neighbour sets; see :func:`tensor_stereo.ops.relate`."""
+    within0, within1 = overlap == degree0, overlap == degree1
+    relation = torch.full_like(overlap, Relation.CONFLICT, dtype=torch.int8)
+    relation[within0] = int(Relation.SUBSET)
+    relation[within1] = int(Relation.SUPERSET)
+    relation[within0 & within1] = int(Relation.EQUAL)
+    # An empty neighbour set is a subset of anything: evidence only where there is nobody else.
+    has_evidence = ((degree0 > 0) & (degree1 > 0)) | (group_size == 1)
+    relation[(group_size < min_group_size) | (group_size == 0) | ~has_evidence] = int(Relation.UNTESTED)
+    last = Relation.SUPERSET if accept_subsets else Relation.EQUAL
+    return relation, (relation >= int(Relation.EQUAL)) & (relation <= int(last))
 
 
 def gated_ssd(features0: Features, features1: Features, config: MatchingConfig) -> tuple[Tensor, ...]:

@@ -7,9 +7,15 @@ from torch import Tensor
 
 from tensor_stereo.ops import reference
 from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.registration import operator
 
 
-@torch.library.custom_op("tensor_stereo::row_overlap", mutates_args=())
+def _fake(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor]:
+    num_rows = crow0.shape[0] - 1
+    return crow0.new_empty(num_rows), crow0.new_empty(num_rows), crow0.new_empty(num_rows)
+
+
+@operator(_fake)
 def row_overlap(
     crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor, backend: str
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -36,9 +42,3 @@ def row_overlap(
     results = kernels.row_overlap(*arrays, torch.get_num_threads())
     overlap, degree0, degree1 = (torch.from_numpy(values).to(crow0.device) for values in results)
     return overlap, degree0, degree1
-
-
-@row_overlap.register_fake
-def _(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor]:
-    num_rows = crow0.shape[0] - 1
-    return crow0.new_empty(num_rows), crow0.new_empty(num_rows), crow0.new_empty(num_rows)

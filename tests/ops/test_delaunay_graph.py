@@ -131,8 +131,14 @@ def test_operators_keep_the_rules_of_torch(backend: str) -> None:
     points = torch.rand(30, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     ptr = torch.tensor([0, 10, 30])
     checks = ("test_schema", "test_faketensor", "test_autograd_registration")
-    torch.library.opcheck(delaunay_graph, (points, ptr, None, 1e-3, backend), test_utils=checks)
-    torch.library.opcheck(match_graphs, (points, points, ptr, points[:, 0], None, 1e-3, backend), test_utils=checks)
+    torch.library.opcheck(
+        torch.ops.tensor_stereo.delaunay_graph.default, (points, ptr, None, 1e-3, backend), test_utils=checks
+    )
+    torch.library.opcheck(
+        torch.ops.tensor_stereo.match_graphs.default,
+        (points, points, ptr, points[:, 0], None, 1e-3, backend),
+        test_utils=checks,
+    )
 
 
 @pytest.mark.parametrize("backend", installed_backends())

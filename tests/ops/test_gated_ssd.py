@@ -51,6 +51,6 @@ def test_order_of_summation_is_exact_for_whole_numbers_and_close_otherwise() -> 
 @pytest.mark.parametrize("backend", installed_backends())
 def test_operator_keeps_the_rules_of_torch_and_compiles(backend: str) -> None:
     arguments = *_views(0, 5, True), 1.0, 0.0, 64.0, backend
-    torch.library.opcheck(gated_ssd, arguments)
+    torch.library.opcheck(torch.ops.tensor_stereo.gated_ssd.default, arguments)
     compiled = torch.compile(lambda: gated_ssd(*arguments)[1] + 1, fullgraph=True, backend="aot_eager")
     assert torch.equal(compiled(), gated_ssd(*arguments)[1] + 1)

@@ -24,8 +24,8 @@ def test_expansions_equal_integer_arithmetic(kind: str) -> None:
 @pytest.mark.parametrize("backend", installed_backends())
 def test_operators_keep_the_rules_of_torch_and_compile(backend: str) -> None:
     rows = torch.rand(4, 7, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).unbind()
-    torch.library.opcheck(orientation, (*rows[:3], backend))
-    torch.library.opcheck(incircle, (*rows, backend))
+    torch.library.opcheck(torch.ops.tensor_stereo.orientation.default, (*rows[:3], backend))
+    torch.library.opcheck(torch.ops.tensor_stereo.incircle.default, (*rows, backend))
     compiled = torch.compile(lambda: incircle(*rows, backend) * 2, fullgraph=True, backend="aot_eager")
     assert torch.equal(compiled(), incircle(*rows, backend) * 2)
 

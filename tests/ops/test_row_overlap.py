@@ -34,7 +34,7 @@ def test_every_back_end_equals_the_dense_product(backend: str, num_rows: int, de
 @pytest.mark.parametrize("backend", installed_backends())
 def test_operator_keeps_the_rules_of_torch_and_compiles(backend: str) -> None:
     one, two = _pattern(0, 20, 0.3), _pattern(1, 20, 0.5)
-    torch.library.opcheck(row_overlap, (*one, *two, backend))
+    torch.library.opcheck(torch.ops.tensor_stereo.row_overlap.default, (*one, *two, backend))
     compiled = torch.compile(lambda: row_overlap(*one, *two, backend)[0] + 1, fullgraph=True, backend="aot_eager")
     assert torch.equal(compiled(), row_overlap(*one, *two, backend)[0] + 1)
 

@@ -1,0 +1,57 @@
+"""classify_matches, points to verdicts, against scipy with Python sets and OpenCV's GMS."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from harness import Suite, matched_points
+from scipy.spatial import Delaunay
+
+import tensor_stereo as ts
+
+PAIRS, COUNT = 64, 1000
+
+
+def neighbor_sets(values: np.ndarray) -> list[set[int]]:
+    offsets, neighbors = Delaunay(values).vertex_neighbor_vertices
+    return [set(neighbors[offsets[i] : offsets[i + 1]].tolist()) for i in range(len(values))]
+
+
+def scipy_and_sets(pairs: list[tuple[np.ndarray, np.ndarray]]) -> list[list[bool]]:
+    verdicts = []
+    for left, right in pairs:
+        sets = zip(neighbor_sets(left), neighbor_sets(right), strict=True)
+        verdicts.append([n0 <= n1 or n1 <= n0 for n0, n1 in sets])
+    return verdicts
+
+
+def main() -> None:
+    suite = Suite("classify")
+    for kind in ("float", "integer"):
+        pairs = [matched_points(kind, COUNT, 10 * b) for b in range(PAIRS)]
+        left, right = (torch.from_numpy(np.concatenate(view)) for view in zip(*pairs, strict=True))
+        matches = ts.Matches(left, right, torch.arange(PAIRS + 1) * COUNT)
+        keypoints = [[[cv2.KeyPoint(float(x), float(y), 1) for x, y in view] for view in pair] for pair in pairs]
+        links = [cv2.DMatch(i, i, 0.0) for i in range(COUNT)]
+
+        def gms(keypoints: list = keypoints, links: list = links) -> None:
+            for kp0, kp1 in keypoints:
+                cv2.xfeatures2d.matchGMS((640, 480), (640, 480), kp0, kp1, links, False, False, 6)
+
+        cases = {
+            "tensor_stereo native": lambda m=matches: ts.classify_matches(m, backend="native"),
+            "tensor_stereo scipy": lambda m=matches: ts.classify_matches(m, backend="scipy"),
+            "OpenCV matchGMS": gms,
+            "scipy Delaunay + Python sets": lambda p=pairs: scipy_and_sets(p),
+        }
+        cv2.setNumThreads(2)
+        title = f"classify, {kind}, {PAIRS} pairs x {COUNT} matches"
+        ratios = suite.compare(title, cases, threads=2, units=PAIRS, repeats=min(9, suite.options.repeats))
+        faster = ratios["scipy Delaunay + Python sets"] / ratios["tensor_stereo scipy"]
+        suite.note(f"scipy back end against the loop, {kind}", times_faster=faster)
+    suite.write()
+
+
+if __name__ == "__main__":
+    main()

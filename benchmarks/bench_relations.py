@@ -1,0 +1,36 @@
+"""What the set tests add to the two graphs."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from harness import Suite, matched_points
+
+import tensor_stereo as ts
+from tensor_stereo.filters import classify_graphs
+from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.ops import row_overlap
+
+
+def main() -> None:
+    suite = Suite("relations")
+    for kind in ("float", "integer"):
+        pairs = [matched_points(kind, 1000, 10 * b) for b in range(64)]
+        left, right = (torch.from_numpy(np.concatenate(view)) for view in zip(*pairs, strict=True))
+        matches = ts.Matches(left, right, torch.arange(65) * 1000)
+        graphs = build_match_graphs(matches)
+        a0, a1 = (graph.to_sparse_csr(torch.int8) for graph in (graphs.adjacency0, graphs.adjacency1))
+        rows = [(a.crow_indices, a.col_indices) for a in (graphs.adjacency0, graphs.adjacency1)]
+        cases = {
+            "two graphs": lambda m=matches: build_match_graphs(m),
+            "relations and verdicts": lambda g=graphs: classify_graphs(g),
+            "row_overlap native": lambda r=rows: row_overlap(*r[0], *r[1], "native"),
+            "row_overlap torch": lambda r=rows: row_overlap(*r[0], *r[1], "scipy"),
+            "torch (A0 * A1).sum(1) on CSR": lambda p=a0, q=a1: (p * q).sum(1, keepdim=True),
+        }
+        suite.compare(f"relations, {kind}, 64 pairs x 1000 matches", cases, threads=2, units=64_000)
+    suite.write()
+
+
+if __name__ == "__main__":
+    main()

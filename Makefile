@@ -6,6 +6,7 @@ export TENSOR_STEREO_DATA ?= $(abspath ../shared/data)
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+CMAKE := $(BIN)/cmake
 # One worker per core, one thread each.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto
 
@@ -45,22 +46,32 @@ imports: $(READY)  ## Check the import rules of the package
 slow: $(READY)  ## Run the tests marked slow, cluster, browser or notebook
 	$(PYTEST) -m 'slow or cluster or browser or notebook'
 
-kernels:  ## Build and run the C++ tests
-	cmake -S kernels -B build/kernels -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON
-	cmake --build build/kernels --parallel
+kernels: $(READY)  ## Build and run the C++ tests
+	$(CMAKE) -S kernels -B build/kernels -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON
+	$(CMAKE) --build build/kernels --parallel
 	build/kernels/test_kernels
 
-sanitize:  ## Build and run the C++ tests with the address and undefined-behaviour sanitizers
-	cmake -S kernels -B build/sanitize -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON \
+sanitize: $(READY)  ## Build and run the C++ tests with the address and undefined-behaviour sanitizers
+	$(CMAKE) -S kernels -B build/sanitize -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON \
 	  -DTENSOR_STEREO_SANITIZE=ON -DCMAKE_BUILD_TYPE=RelWithDebInfo
-	cmake --build build/sanitize --parallel
+	$(CMAKE) --build build/sanitize --parallel
 	build/sanitize/test_kernels
 
-fuzz:  ## Fuzz the graph builder for a minute (needs clang++ with libFuzzer)
-	cmake -S kernels -B build/fuzz -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_FUZZ=ON -DTENSOR_STEREO_SANITIZE=ON \
+fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFuzzer)
+	$(CMAKE) -S kernels -B build/fuzz -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_FUZZ=ON -DTENSOR_STEREO_SANITIZE=ON \
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_COMPILER=clang++
-	cmake --build build/fuzz --parallel
+	$(CMAKE) --build build/fuzz --parallel
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
+
+BENCH_VENV ?= .venv-bench
+SUITES := graphs relations classify matching pipeline scaling adversarial
+
+bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)
+	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)
+	$(BENCH_VENV)/bin/python -m pip install --quiet -c $(CONSTRAINTS) torch kornia numpy scipy mahotas polars rich tyro \
+	  matplotlib pillow opencv-contrib-python-headless shull
+	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps --force-reinstall .
+	cd benchmarks && for suite in $(SUITES); do $(abspath $(BENCH_VENV))/bin/python bench_$$suite.py || exit 1; done
 
 hooks: $(READY)  ## Install the git hooks
 	$(BIN)/pre-commit install

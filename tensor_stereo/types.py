@@ -221,7 +221,8 @@ def check_ptr(name: str, ptr: Tensor, num_rows: int) -> None:
         raise ValueError(f"{name} must have shape (B + 1,), got {tuple(ptr.shape)}")
     if ptr.dtype != torch.int64:
         raise TypeError(f"{name} must be int64, got {ptr.dtype}")
-    if int(ptr[0]) != 0 or int(ptr[-1]) != num_rows or bool((ptr.diff() < 0).any()):
+    offsets = ptr.numpy(force=True)
+    if offsets[0] != 0 or offsets[-1] != num_rows or (offsets[1:] < offsets[:-1]).any():
         raise ValueError(f"{name} must rise from 0 to the number of rows {num_rows}, got {ptr.tolist()[:10]}")
 
 

@@ -23,9 +23,8 @@ class GraphEdges {
           // Below this sine of an angle, roughly, rounding could make a dual length of zero pass for one of e.
           condition_(16 * kEpsilon * (bound_ + 1) / tie_tolerance) {}
 
-    // Calls keep(i, j) for both directions of each edge of the graph, vertices in the mesh's own order.
-    template <class Keep>
-    void select(const Triangulation& mesh, const Keep& keep) {
+    // Decides which edges of the mesh belong to the graph.
+    void decide(const Triangulation& mesh) {
         const auto half_edges = static_cast<Index>(mesh.origin.size());
         const Index* const twin = mesh.twin.data();
         state_.assign(half_edges, kLong);
@@ -50,13 +49,19 @@ class GraphEdges {
             }
             if (any_tie) settle_ties(mesh);
         }
+    }
+
+    // Calls visit(i, j) for both directions of each of them, vertices in the mesh's own order.
+    template <class Visit>
+    void each(const Triangulation& mesh, const Visit& visit) const {
+        const auto half_edges = static_cast<Index>(mesh.origin.size());
         for (Index t = 0; t < half_edges; t += 3) {
             const Index* const v = mesh.origin.data() + t;
             const std::pair<Index, Index> sides[] = {{v[0], v[1]}, {v[1], v[2]}, {v[2], v[0]}};
             for (Index k = 0; k < 3; ++k) {
                 if (state_[t + k] != kLong) continue;
-                keep(sides[k].first, sides[k].second);
-                if (twin[t + k] == kNone) keep(sides[k].second, sides[k].first);
+                visit(sides[k].first, sides[k].second);
+                if (mesh.twin[t + k] == kNone) visit(sides[k].second, sides[k].first);
             }
         }
     }
@@ -183,16 +188,17 @@ class Builder {
     // Writes the degrees of the vertices and, one row after the other, their ascending neighbours (at most 6 count).
     void build(const std::int64_t* index, std::size_t count, Index* degree, Index* neighbors) {
         std::fill_n(degree, count, 0);
-        pairs_.clear();
-        if (count > 0) collect_edges(index, count);
-        for (const Pair& pair : pairs_) ++degree[pair.i];
+        if (count == 0) return;
+        triangulate(points_, index, count, mesh_, workspace_);
+        if (!mesh_.is_collinear) edges_.decide(mesh_);
+        each_edge([degree](Index i, Index) { ++degree[i]; });
         start_.resize(count + 1);
         start_[0] = 0;
         for (std::size_t v = 0; v < count; ++v) start_[v + 1] = start_[v] + degree[v];
         // The pattern is symmetric: filling the rows in any order and transposing sorts them without a comparison.
-        unsorted_.resize(pairs_.size());
+        unsorted_.resize(start_[count]);
         position_.assign(start_.begin(), start_.end() - 1);
-        for (const Pair& pair : pairs_) unsorted_[position_[pair.i]++] = pair.j;
+        each_edge([this](Index i, Index j) { unsorted_[position_[i]++] = j; });
         position_.assign(start_.begin(), start_.end() - 1);
         for (std::size_t v = 0; v < count; ++v) {
             for (Index k = start_[v]; k < start_[v + 1]; ++k) {
@@ -202,31 +208,24 @@ class Builder {
     }
 
    private:
-    void collect_edges(const std::int64_t* index, std::size_t count) {
-        triangulate(points_, index, count, mesh_, workspace_);
-        const Index* vertex = mesh_.vertex.data();
+    // Both directions of every edge, vertices as in the input.
+    template <class Visit>
+    void each_edge(const Visit& visit) const {
+        const Index* const vertex = mesh_.vertex.data();
         if (mesh_.is_collinear) {
-            for (std::size_t k = 0; k + 1 < count; ++k) {
-                pairs_.push_back({vertex[k], vertex[k + 1]});
-                pairs_.push_back({vertex[k + 1], vertex[k]});
+            for (std::size_t k = 0; k + 1 < mesh_.vertex.size(); ++k) {
+                visit(vertex[k], vertex[k + 1]);
+                visit(vertex[k + 1], vertex[k]);
             }
-            return;
+        } else {
+            edges_.each(mesh_, [&](Index i, Index j) { visit(vertex[i], vertex[j]); });
         }
-        pairs_.resize(2 * mesh_.origin.size());
-        Pair* end = pairs_.data();
-        edges_.select(mesh_, [&](Index i, Index j) { *end++ = {vertex[i], vertex[j]}; });
-        pairs_.resize(end - pairs_.data());
     }
-
-    struct Pair {
-        Index i, j;
-    };
 
     const double* points_;
     GraphEdges edges_;
     Triangulation mesh_;
     Workspace workspace_;
-    std::vector<Pair> pairs_;
     std::vector<Index> start_, position_, unsorted_;
 };
 

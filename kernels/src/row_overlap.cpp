@@ -37,7 +37,7 @@ void relate(const std::int64_t* overlap, const std::int64_t* degree0, const std:
         const bool within0 = overlap[k] == degree0[k], within1 = overlap[k] == degree1[k];
         const bool has_evidence = (degree0[k] > 0 && degree1[k] > 0) || group_size[k] == 1;
         const bool is_tested = group_size[k] >= min_group_size && group_size[k] > 0 && has_evidence;
-        relation[k] = is_tested ? kTable[within0 + 2 * within1] : kUntested;
+        relation[k] = is_tested ? kTable[within0 + 2 * within1] : static_cast<std::int8_t>(kUntested);
         inlier[k] = relation[k] >= kEqual && relation[k] <= last;
     }
 }

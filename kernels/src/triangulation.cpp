@@ -50,23 +50,30 @@ void sort_radially(const double* points, const std::int64_t* index, std::size_t 
         for (const std::uint64_t key : workspace.keys) workspace.keys_buffer[bucket[(key >> shift) & 255]++] = key;
         workspace.keys.swap(workspace.keys_buffer);
     }
-    result.points.resize(count);
-    result.vertex.resize(count);
-    workspace.distance.resize(count);
+    auto& order = workspace.order;
+    order.resize(count);
+    std::size_t shifts = 0;
     for (std::size_t k = 0; k < count; ++k) {
         const auto row = static_cast<Index>(workspace.keys[k] & 0xffffffff);
-        const Point point{points[2 * index[row]], points[2 * index[row] + 1]};
-        const double dx = point.x - centre.x, dy = point.y - centre.y;
-        const double distance = dx * dx + dy * dy;
+        const double dx = points[2 * index[row]] - centre.x, dy = points[2 * index[row] + 1] - centre.y;
+        const Radial item{dx * dx + dy * dy, row};
         std::size_t hole = k;
-        for (; hole > 0 && workspace.distance[hole - 1] > distance; --hole) {
-            workspace.distance[hole] = workspace.distance[hole - 1];
-            result.points[hole] = result.points[hole - 1];
-            result.vertex[hole] = result.vertex[hole - 1];
+        if (shifts <= 8 * count) {
+            for (; hole > 0 && order[hole - 1].distance > item.distance; --hole, ++shifts) order[hole] = order[hole - 1];
         }
-        workspace.distance[hole] = distance;
-        result.points[hole] = point;
-        result.vertex[hole] = row;
+        order[hole] = item;
+    }
+    if (shifts > 8 * count) {  // points on a circle are all alike as floats
+        std::sort(order.begin(), order.end(), [](const Radial& a, const Radial& b) {
+            return a.distance < b.distance || (a.distance == b.distance && a.row < b.row);
+        });
+    }
+    result.points.resize(count);
+    result.vertex.resize(count);
+    for (std::size_t k = 0; k < count; ++k) {
+        const Index row = order[k].row;
+        result.points[k] = {points[2 * index[row]], points[2 * index[row] + 1]};
+        result.vertex[k] = row;
     }
 }
 

@@ -26,10 +26,16 @@ struct Triangulation {
 inline Index next_in_triangle(Index h) noexcept { return h % 3 == 2 ? h - 2 : h + 1; }
 inline Index previous_in_triangle(Index h) noexcept { return h % 3 == 0 ? h + 2 : h - 1; }
 
+// A row of the input and its squared distance from the centre of the sweep.
+struct Radial {
+    double distance;
+    Index row;
+};
+
 // Memory that is kept from one segment to the next.
 struct Workspace {
     std::vector<std::uint64_t> keys, keys_buffer;
-    std::vector<double> distance;
+    std::vector<Radial> order;
     std::vector<Index> hull_next, hull_previous, hull_edge, hull_hash, stack;
 };
 

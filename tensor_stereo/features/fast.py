@@ -65,7 +65,10 @@ def _detect(image: Tensor, config: FASTConfig) -> tuple[Tensor, Tensor]:
     if not found:
         return torch.zeros(0, 2), torch.zeros(0)
     keypoints = torch.from_numpy(cv2.KeyPoint.convert(found))
-    scores = corner_score(image, keypoints.to(torch.int64))
+    if config.nonmax_suppression:
+        scores = torch.tensor([keypoint.response for keypoint in found])
+    else:
+        scores = corner_score(image, keypoints.to(torch.int64))
     order = strongest_first(keypoints, scores, config.max_keypoints)
     return keypoints[order], scores[order]
 

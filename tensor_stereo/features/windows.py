@@ -51,9 +51,11 @@ def extract_windows(images: Tensor, keypoints: Tensor, ptr: Tensor, *, window_px
     x, y = nearest.to(torch.int64).unbind(1)
 
     radius = window_px // 2
-    padded = images[:, 0, _mirror(height, radius, images.device)][..., _mirror(width, radius, images.device)]
-    windows = padded.unfold(1, window_px, 1).unfold(2, window_px, 1)  # (B, H, W, window_px, window_px), a view
-    return windows[ptr_to_batch(ptr), y, x].flatten(1).to(torch.float32)
+    offsets = torch.arange(window_px, device=images.device)
+    rows = _mirror(height, radius, images.device)[y[:, None] + offsets]  # (N, window_px)
+    columns = _mirror(width, radius, images.device)[x[:, None] + offsets]
+    places = (ptr_to_batch(ptr)[:, None] * height + rows)[:, :, None] * width + columns[:, None]
+    return images.reshape(-1)[places].flatten(1).to(torch.float32)
 
 
 def _mirror(size: int, radius: int, device: torch.device) -> Tensor:

@@ -4,11 +4,11 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
-#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <tuple>
 
+#include "tensor_stereo/buffer.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
 #include "tensor_stereo/gated_ssd.hpp"
 #include "tensor_stereo/one_to_one.hpp"
@@ -30,15 +30,10 @@ template <class T>
 using Output = nb::ndarray<nb::numpy, T, nb::ndim<1>>;
 
 template <class T>
-Output<T> give(std::unique_ptr<T[]> values, std::size_t size) {
+Output<T> give(ts::Buffer<T> values, std::size_t size) {
     T* const data = values.release();
-    nb::capsule owner(data, [](void* memory) noexcept { delete[] static_cast<T*>(memory); });
+    nb::capsule owner(data, [](void* memory) noexcept { ts::Free()(memory); });
     return Output<T>(data, {size}, owner);
-}
-
-template <class T>
-std::unique_ptr<T[]> allocate(std::size_t size) {
-    return std::unique_ptr<T[]>(new T[size]);
 }
 
 void check(bool condition, const char* message) {
@@ -72,8 +67,8 @@ auto row_overlap(Integers crow0, Integers cols0, Integers crow1, Integers cols1,
     check_offsets(crow0, static_cast<std::int64_t>(cols0.shape(0)), "crow0 must rise from 0 to the length of cols0");
     check_offsets(crow1, static_cast<std::int64_t>(cols1.shape(0)), "crow1 must rise from 0 to the length of cols1");
     const std::size_t num_rows = crow0.shape(0) - 1;
-    auto overlap = allocate<std::int64_t>(num_rows), degree0 = allocate<std::int64_t>(num_rows),
-         degree1 = allocate<std::int64_t>(num_rows);
+    auto overlap = ts::allocate<std::int64_t>(num_rows), degree0 = ts::allocate<std::int64_t>(num_rows),
+         degree1 = ts::allocate<std::int64_t>(num_rows);
     {
         const nb::gil_scoped_release release;
         ts::row_overlap(crow0.data(), cols0.data(), crow1.data(), cols1.data(), static_cast<std::int64_t>(num_rows),
@@ -88,8 +83,8 @@ auto relate(Integers overlap, Integers degree0, Integers degree1, Integers group
     const std::size_t count = overlap.shape(0);
     check(degree0.shape(0) == count && degree1.shape(0) == count && group_size.shape(0) == count,
           "overlap, degree0, degree1 and group_size must have the same length");
-    auto relation = allocate<std::int8_t>(count);
-    auto inlier = allocate<bool>(count);
+    auto relation = ts::allocate<std::int8_t>(count);
+    auto inlier = ts::allocate<bool>(count);
     {
         const nb::gil_scoped_release release;
         ts::relate(overlap.data(), degree0.data(), degree1.data(), group_size.data(), static_cast<std::int64_t>(count),
@@ -103,7 +98,7 @@ auto one_to_one(Points points0, Points points1, Integers ptr, std::optional<Doub
     check(points1.shape(0) == num_matches, "points0 and points1 must have the same length");
     check(!cost || cost->shape(0) == num_matches, "cost must have one entry per match");
     check_offsets(ptr, static_cast<std::int64_t>(num_matches), "ptr must rise from 0 to the number of matches");
-    auto kept = allocate<bool>(num_matches);
+    auto kept = ts::allocate<bool>(num_matches);
     {
         const nb::gil_scoped_release release;
         ts::one_to_one(points0.data(), points1.data(), ptr.data(), static_cast<std::int64_t>(ptr.shape(0)) - 1,
@@ -125,8 +120,8 @@ auto gated_ssd(Points keypoints0, Points keypoints1, Matrix descriptors0, Matrix
     check(ptr0.shape(0) == ptr1.shape(0), "ptr0 and ptr1 must have the same length");
     check_offsets(ptr0, static_cast<std::int64_t>(num0), "ptr0 must rise from 0 to the number of keypoints");
     check_offsets(ptr1, static_cast<std::int64_t>(num1), "ptr1 must rise from 0 to the number of keypoints");
-    auto cost = allocate<float>(num0), second_cost = allocate<float>(num0), cost1 = allocate<float>(num1);
-    auto index = allocate<std::int64_t>(num0), index1 = allocate<std::int64_t>(num1);
+    auto cost = ts::allocate<float>(num0), second_cost = ts::allocate<float>(num0), cost1 = ts::allocate<float>(num1);
+    auto index = ts::allocate<std::int64_t>(num0), index1 = ts::allocate<std::int64_t>(num1);
     {
         const nb::gil_scoped_release release;
         ts::gated_ssd({keypoints0.data(), descriptors0.data(), ptr0.data()},
@@ -144,7 +139,7 @@ ts::Point point(const Points& points, std::size_t k) { return {points.data()[2 *
 auto orientation(Points a, Points b, Points c) {
     const std::size_t count = a.shape(0);
     check(b.shape(0) == count && c.shape(0) == count, "a, b and c must have the same length");
-    auto signs = allocate<std::int8_t>(count);
+    auto signs = ts::allocate<std::int8_t>(count);
     for (std::size_t k = 0; k < count; ++k) {
         signs[k] = static_cast<std::int8_t>(ts::exact_orientation(point(a, k), point(b, k), point(c, k)));
     }
@@ -154,7 +149,7 @@ auto orientation(Points a, Points b, Points c) {
 auto incircle(Points a, Points b, Points c, Points d) {
     const std::size_t count = a.shape(0);
     check(b.shape(0) == count && c.shape(0) == count && d.shape(0) == count, "a, b, c and d must have the same length");
-    auto signs = allocate<std::int8_t>(count);
+    auto signs = ts::allocate<std::int8_t>(count);
     for (std::size_t k = 0; k < count; ++k) {
         signs[k] = static_cast<std::int8_t>(ts::exact_incircle(point(a, k), point(b, k), point(c, k), point(d, k)));
     }

@@ -17,7 +17,6 @@ from tensor_stereo.batching import concatenate_features
 from tensor_stereo.configs import MatchingConfig
 from tensor_stereo.matching import MatchIndices, match_features, match_indices
 from tensor_stereo.ops import reference
-from tensor_stereo.ops.reference import gated_candidates
 from tensor_stereo.types import Features
 
 WIDE = {"max_row_offset_px": 1e6}  # a gate that lets everything through: the ragged search instead of the dense one
@@ -241,7 +240,7 @@ def test_bounds_of_gates_are_inside(config: MatchingConfig, inside: list[tuple[f
 def test_candidates_are_the_pairs_inside_the_gates(config: MatchingConfig, grid: float, seed: int) -> None:
     generator = np.random.default_rng(seed)
     views = [make_features(generator, [6, 0, 9], grid=grid) for _ in range(2)]
-    index0, index1 = (torch.cat(rows).numpy() for rows in zip(*gated_candidates(*views, config), strict=True))
+    index0, index1 = (torch.cat(rows).numpy() for rows in zip(*reference.gated_candidates(*views, config), strict=True))
     points0, points1 = (view.keypoints.double().numpy() for view in views)
     image = np.arange(15) >= 6
     expected = is_inside(points0, points1, config) & (image[:, None] == image)
@@ -268,7 +267,7 @@ def test_memory_limits_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reference, "_CHUNK_VALUES", 7)
     monkeypatch.setattr(reference, "_CHUNK_CANDIDATES", 11)
     monkeypatch.setenv("TENSOR_STEREO_BACKEND", "scipy")
-    blocks = list(gated_candidates(*views, MatchingConfig(max_row_offset_px=2)))
+    blocks = list(reference.gated_candidates(*views, MatchingConfig(max_row_offset_px=2)))
     assert len(blocks) > 5
     assert max(len(index0) for index0, _ in blocks) <= 11 + 30
     assert all(same(match_indices(*pair, config), e) for (pair, config), e in zip(cases, expected, strict=True))

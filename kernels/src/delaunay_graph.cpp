@@ -236,10 +236,11 @@ SparsePattern delaunay_graph(const double* points, std::int64_t num_points, cons
                              int num_threads) {
     SparsePattern result;
     result.num_rows = num_points;
-    result.crow.reset(new std::int64_t[num_points + 1]());
+    result.crow = allocate<std::int64_t>(num_points + 1);
+    std::fill_n(result.crow.get(), num_points + 1, 0);
     const std::int64_t num_vertices = ptr[num_segments];
-    std::unique_ptr<Index[]> degree(new Index[num_vertices]);
-    std::unique_ptr<Index[]> neighbors(new Index[6 * num_vertices]);  // a planar graph has fewer than 6 per vertex
+    const auto degree = allocate<Index>(num_vertices);
+    const auto neighbors = allocate<Index>(6 * num_vertices);  // a planar graph has fewer than 6 per vertex
     parallel_for(num_segments, 1, num_threads, [&] {
         return [&, builder = Builder(points, tie_tolerance)](std::int64_t begin, std::int64_t end) mutable {
             for (std::int64_t s = begin; s < end; ++s) {
@@ -251,7 +252,7 @@ SparsePattern delaunay_graph(const double* points, std::int64_t num_points, cons
         };
     });
     for (std::int64_t row = 0; row < num_points; ++row) result.crow[row + 1] += result.crow[row];
-    result.cols.reset(new std::int64_t[result.crow[num_points]]);
+    result.cols = allocate<std::int64_t>(result.crow[num_points]);
     parallel_for(num_segments, 1, num_threads, [&] {
         return [&](std::int64_t begin, std::int64_t end) {
             for (std::int64_t s = begin; s < end; ++s) {

@@ -29,7 +29,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     if (count == 0 || ts::first_point_out_of_range(values.data(), count) >= 0) return 0;
     const std::int64_t ptr[] = {0, count};
     std::vector<std::int64_t> index;
-    const auto kept = std::make_unique<bool[]>(count);
+    const auto kept = ts::allocate<bool>(count);
     ts::one_to_one(values.data(), values.data(), ptr, 1, nullptr, 1, kept.get());
     for (std::int64_t k = 0; k < count; ++k) {
         if (kept[k]) index.push_back(k);

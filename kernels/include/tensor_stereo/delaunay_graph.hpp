@@ -2,14 +2,15 @@
 #pragma once
 
 #include <cstdint>
-#include <memory>
+
+#include "tensor_stereo/buffer.hpp"
 
 namespace tensor_stereo {
 
 // Compressed rows of a symmetric boolean matrix, columns ascending within each row.
 struct SparsePattern {
-    std::unique_ptr<std::int64_t[]> crow;  // (num_rows + 1) offsets
-    std::unique_ptr<std::int64_t[]> cols;  // (crow[num_rows])
+    Buffer<std::int64_t> crow;  // (num_rows + 1) offsets
+    Buffer<std::int64_t> cols;  // (crow[num_rows])
     std::int64_t num_rows = 0;
 };
 

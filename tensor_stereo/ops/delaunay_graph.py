@@ -22,31 +22,19 @@ Pattern = tuple[Tensor, Tensor]  # crow (N + 1,), cols (nnz,)
 SMALLEST, LARGEST = 1e-60, 1e60  # magnitudes whose degree-4 determinants neither underflow nor overflow
 
 
-def _fake_pattern(keypoints: Tensor, ptr: Tensor) -> Pattern:
+def _fake_pattern(keypoints: Tensor, ptr: Tensor, *_: object) -> Pattern:
     num_entries = torch.library.get_ctx().new_dynamic_size()
     return ptr.new_empty(keypoints.shape[0] + 1), ptr.new_empty(num_entries)
 
 
-def _fake_graph(
-    keypoints: Tensor, ptr: Tensor, group: Tensor | None, tie_tolerance: float, backend: str
-) -> tuple[Tensor, Tensor]:
-    return _fake_pattern(keypoints, ptr)
-
-
 def _fake_match_graphs(
-    keypoints0: Tensor,
-    keypoints1: Tensor,
-    ptr: Tensor,
-    cost: Tensor | None,
-    group: Tensor | None,
-    tie_tolerance: float,
-    backend: str,
+    keypoints0: Tensor, keypoints1: Tensor, ptr: Tensor, *_: object
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     size = ptr.new_empty(keypoints0.shape[0], device=keypoints0.device)
     return (*_fake_pattern(keypoints0, ptr), *_fake_pattern(keypoints1, ptr), size)
 
 
-@operator(_fake_graph)
+@operator(_fake_pattern)
 def delaunay_graph(
     keypoints: Tensor, ptr: Tensor, group: Tensor | None, tie_tolerance: float, backend: str
 ) -> tuple[Tensor, Tensor]:

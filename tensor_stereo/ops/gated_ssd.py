@@ -14,18 +14,7 @@ from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import Features
 
 
-def _fake(
-    keypoints0: Tensor,
-    keypoints1: Tensor,
-    descriptors0: Tensor,
-    descriptors1: Tensor,
-    ptr0: Tensor,
-    ptr1: Tensor,
-    max_row_offset_px: float,
-    min_disparity_px: float,
-    max_disparity_px: float,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _fake(keypoints0: Tensor, keypoints1: Tensor, *_: object) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     num0, num1 = keypoints0.shape[0], keypoints1.shape[0]
     cost = keypoints0.new_empty(num0, dtype=torch.float32)
     cost1 = keypoints0.new_empty(num1, dtype=torch.float32)

@@ -11,15 +11,11 @@ from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import check_points, check_rows
 
 
-def _fake_orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
+def _fake(a: Tensor, *_: object) -> Tensor:
     return a.new_empty(a.shape[0], dtype=torch.int8)
 
 
-def _fake_incircle(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor:
-    return a.new_empty(a.shape[0], dtype=torch.int8)
-
-
-@operator(_fake_orientation)
+@operator(_fake)
 def orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
     """Exact turn of the path a, b, c; see :func:`tensor_stereo.delaunay.predicates.orientation`.
 
@@ -40,7 +36,7 @@ def orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
     return _signs("orientation", (a, b, c), backend)
 
 
-@operator(_fake_incircle)
+@operator(_fake)
 def incircle(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor:
     """Exact side of the circle through a, b, c; see :func:`tensor_stereo.delaunay.predicates.incircle`.
 

@@ -20,7 +20,8 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[P, R]], Callable[P,
     Eager calls on plain tensors go straight to the function, which spares them the dispatcher: 0.1 ms a call.
 
     Args:
-        fake: makes empty results of the right shape from the same arguments.
+        fake: makes empty results of the right shape from the same positional arguments; those that no shape depends on
+            may be swallowed by ``*_``.
     """
 
     def register(function: Callable[P, R]) -> Callable[P, R]:

@@ -2,6 +2,7 @@ VENV ?= .venv
 PYTHON ?= python3
 CONSTRAINTS ?= constraints.txt
 OUT ?= out
+CLANG ?= clang++
 export TENSOR_STEREO_DATA ?= $(abspath ../shared/data)
 
 BIN := $(VENV)/bin
@@ -59,7 +60,7 @@ sanitize: $(READY)  ## Build and run the C++ tests with the address and undefine
 
 fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFuzzer)
 	$(CMAKE) -S kernels -B build/fuzz -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_FUZZ=ON -DTENSOR_STEREO_SANITIZE=ON \
-	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_COMPILER=clang++
+	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_COMPILER=$(CLANG)
 	$(CMAKE) --build build/fuzz --parallel
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
 

@@ -1,4 +1,5 @@
-// libFuzzer target: the sweep and divide and conquer must find the same graph for any bytes, with and without tolerance.
+// libFuzzer target: for any bytes the graph is symmetric and shrinks with the tolerance, divide and conquer makes as many
+// triangles as the sweep, and small integers give the graph of the circle definition.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -12,8 +13,32 @@
 
 namespace ts = tensor_stereo;
 
+namespace {
+
+// Whether a circle through points i and j has every other point strictly outside, in exact integers (|x|, |y| <= 16).
+bool is_edge(const std::vector<double>& values, const std::vector<std::int64_t>& index, std::int64_t i, std::int64_t j) {
+    const auto x = [&](std::int64_t k) { return 2 * static_cast<std::int64_t>(values[2 * k]); };  // midpoints are integers
+    const auto y = [&](std::int64_t k) { return 2 * static_cast<std::int64_t>(values[2 * k + 1]); };
+    const std::int64_t mx = (x(i) + x(j)) / 2, my = (y(i) + y(j)) / 2, nx = y(i) - y(j), ny = x(j) - x(i);
+    const std::int64_t radius = (x(i) - mx) * (x(i) - mx) + (y(i) - my) * (y(i) - my);
+    // Centre m + t n: a t + b > 0 for points outside; low < t < high with bounds as fractions of positive denominator.
+    bool has_low = false, has_high = false;
+    std::int64_t low = 0, low_by = 1, high = 0, high_by = 1;
+    for (const std::int64_t k : index) {
+        if (k == i || k == j) continue;
+        const std::int64_t a = 2 * (nx * (mx - x(k)) + ny * (my - y(k)));
+        const std::int64_t b = (mx - x(k)) * (mx - x(k)) + (my - y(k)) * (my - y(k)) - radius;
+        if (a == 0 && b <= 0) return false;
+        if (a > 0 && (!has_low || -b * low_by > low * a)) has_low = true, low = -b, low_by = a;
+        if (a < 0 && (!has_high || b * high_by < high * -a)) has_high = true, high = b, high_by = -a;
+    }
+    return !has_low || !has_high || low * high_by < high * low_by;
+}
+
+}  // namespace
+
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
-    if (size < 1) return 0;
+    if (size < 17) return 0;
     // The first byte chooses how bytes become coordinates: raw doubles, or small integers times a step.
     const std::uint8_t mode = data[0];
     std::vector<double> values;
@@ -44,6 +69,14 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
                 const std::int64_t* begin = graph.cols.get() + graph.crow[graph.cols[k]];
                 const std::int64_t* end = graph.cols.get() + graph.crow[graph.cols[k] + 1];
                 if (!std::binary_search(begin, end, row)) std::abort();  // not symmetric
+            }
+        }
+        if (mode % 4 != 1 || tie_tolerance != 0 || index.size() > 24) continue;
+        for (const std::int64_t i : index) {
+            for (const std::int64_t j : index) {
+                const std::int64_t* begin = graph.cols.get() + graph.crow[i];
+                const std::int64_t* end = graph.cols.get() + graph.crow[i + 1];
+                if (i != j && std::binary_search(begin, end, j) != is_edge(values, index, i, j)) std::abort();
             }
         }
     }

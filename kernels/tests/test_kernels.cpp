@@ -124,7 +124,11 @@ void test_bounds_agree_with_exact_signs() {
         for (const double scale : {1.0, 0.1, 1e-3}) {
             auto points = random_integers(rng, 200, range);
             for (auto& p : points) p = {p.x * scale, p.y * scale};
-            const auto bounds = ts::determinant_bounds(points.data(), points.size());
+            double side = 0;
+            for (const auto& p : points) {
+                for (const auto& q : points) side = std::max({side, p.x - q.x, p.y - q.y});
+            }
+            const auto bounds = ts::determinant_bounds(points.data(), points.size(), side);
             std::uniform_int_distribution<std::size_t> any(0, points.size() - 1);
             for (int k = 0; k < 2000; ++k) {
                 const auto a = points[any(rng)], b = points[any(rng)], c = points[any(rng)], d = points[any(rng)];

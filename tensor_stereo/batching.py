@@ -187,3 +187,18 @@ def concatenate_features(items: Sequence[Features]) -> Features:
         descriptors=torch.cat([item.descriptors for item in items]),
         scores=torch.cat([item.scores for item in items]),
     )
+
+
+def split_features(features: Features) -> list[Features]:
+    """The images of a feature batch one by one, as views of the same memory.
+
+    >>> features = Features(torch.zeros(3, 2), torch.tensor([0, 1, 3]), torch.zeros(3, 4), torch.arange(3.0))
+    >>> [part.scores.tolist() for part in split_features(features)]
+    [[0.0], [1.0, 2.0]]
+    """
+    columns = (features.keypoints, features.descriptors, features.scores)
+    parts = zip(*(column.split(features.ptr.diff().tolist()) for column in columns), strict=True)
+    return [
+        Features(keypoints, features.ptr.new_tensor([0, len(keypoints)]), descriptors, scores)
+        for keypoints, descriptors, scores in parts
+    ]

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
-from tensor_stereo.batching import concatenate_features
+from tensor_stereo.batching import concatenate_features, split_features
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.filters import classify_graphs
@@ -103,12 +104,10 @@ def to_gray_pairs(pairs: Sequence[ImagePair]) -> list[ImagePair]:
 
 
 def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwatch) -> Matches:
-    """Features of every image, then the putative matches of every pair.
-
-    Images run one by one: not every detector is bit-equal in a batch, and none is faster in one.
-    """
+    """Features of every image, then the putative matches of every pair."""
     with watch.measure("detect"):
-        features0, features1 = (detect_views([pair[view] for pair in gray], config) for view in (0, 1))
+        found = detect_images([pair[view] for view in (0, 1) for pair in gray], config)
+        features0, features1 = (concatenate_features(part) for part in (found[: len(gray)], found[len(gray) :]))
     with watch.measure("match"):
         matching = config.matching
         if matching.max_ratio is None and config.detector == "sift":
@@ -116,9 +115,16 @@ def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwa
         return match_features(features0, features1, matching)
 
 
-def detect_views(images: Sequence[Tensor], config: PipelineConfig) -> Features:
-    """Features of a list of (1, 1, H, W) images of any sizes."""
-    return concatenate_features([detect_features(image, config) for image in images])
+def detect_images(images: Sequence[Tensor], config: PipelineConfig) -> list[Features]:
+    """Features of each of a list of (1, 1, H, W) images of any sizes; those of one size share a batch."""
+    of_size: dict[torch.Size, list[int]] = {}
+    for k, image in enumerate(images):
+        of_size.setdefault(image.shape, []).append(k)
+    found: dict[int, Features] = {}
+    for places in of_size.values():
+        features = detect_features(torch.cat([images[k] for k in places]), config)
+        found.update(zip(places, split_features(features), strict=True))
+    return [found[k] for k in range(len(images))]
 
 
 def group_pairs(gray: Sequence[ImagePair], matches: Matches, config: PipelineConfig, watch: Stopwatch) -> Matches:

@@ -19,6 +19,8 @@ from tensor_stereo.delaunay.divide import divide_and_conquer
 from tensor_stereo.delaunay.mesh import HULL, Int, Mesh, build_mesh
 from tensor_stereo.delaunay.predicates import Float
 
+_BLOCK = 4096
+
 
 def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads: int) -> Int:
     """Edges of the Delaunay graph of every segment.
@@ -27,7 +29,7 @@ def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads
         points: (N, 2) float64, distinct within a segment, 0 or 1e-60..1e60 in magnitude.
         ptr: (S + 1,) int64 offsets of the segments.
         tie_tolerance: e of the module's docstring, in edge lengths; 0 gives the exact strict graph.
-        num_threads: threads that run Qhull.
+        num_threads: threads that share the segments.
 
     Returns:
         (E, 2) int64 pairs of global point indices, each edge once, in no particular order.
@@ -39,14 +41,29 @@ def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads
         >>> sorted(map(tuple, np.sort(edges, axis=1).tolist()))  # no diagonal
         [(0, 1), (0, 3), (1, 2), (2, 3)]
     """
+    blocks = _blocks(ptr)
+    if num_threads > 1 and len(blocks) > 1:
+        with ThreadPoolExecutor(num_threads) as pool:
+            found = list(pool.map(lambda block: _block_edges(points, ptr[block], tie_tolerance), blocks))
+    else:
+        found = [_block_edges(points, ptr[block], tie_tolerance) for block in blocks]
+    return np.concatenate([np.empty((0, 2), dtype=np.int64), *found])
+
+
+def _blocks(ptr: Int) -> list[slice]:
+    """Runs of segments, as slices of ptr, of about so many points that the arrays of one run stay in cache."""
+    block = ptr[:-1] // _BLOCK
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    return [slice(start, stop + 1) for start, stop in zip(first, np.append(first[1:], len(block)), strict=True)]
+
+
+def _block_edges(points: Float, ptr: Int, tie_tolerance: float) -> Int:
+    """Edges of consecutive segments, as pairs of global point indices."""
+    start = ptr[0]
+    points, ptr = points[start : ptr[-1]], ptr - start
     size = np.diff(ptr)
     segments = np.flatnonzero(size > 2)
-    parts = [points[ptr[s] : ptr[s + 1]] for s in segments]
-    if num_threads > 1 and len(parts) > 1:
-        with ThreadPoolExecutor(num_threads) as pool:
-            proposals = list(pool.map(_qhull, parts))
-    else:
-        proposals = [_qhull(part) for part in parts]
+    proposals = [_qhull(points[ptr[s] : ptr[s + 1]]) for s in segments]
     edges, faulty = _certified_edges(points, ptr, proposals, segments, tie_tolerance)
     found = [edges, ptr[:-1][size == 2][:, None] + np.array([0, 1])]
     if len(faulty):
@@ -56,7 +73,7 @@ def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads
         if len(wrong):
             raise RuntimeError(f"the exact triangulation of segments {wrong[:10].tolist()} fails its own proof")
         found += [edges, *(_path(points, ptr, s) for s in faulty[flat])]
-    return np.concatenate(found)
+    return np.concatenate(found) + start
 
 
 def _qhull(points: Float) -> Int:
@@ -96,9 +113,11 @@ def _dual_length(points: Float, mesh: Mesh, bound: float) -> Float:
     In edge lengths, the centre of the circle through i, j and k lies cot(angle at k) / 2 from the midpoint of {i, j}.
     """
     opposite = _canonical_opposite(points, mesh)
+    i, j = (points.take(vertex, axis=0) for vertex in mesh.edges.T)
     ends = []
     for k in opposite.T:
-        v, w = points[mesh.edges[:, 0]] - points[k], points[mesh.edges[:, 1]] - points[k]
+        corner = points.take(k, axis=0, mode="wrap")  # HULL has none, and is not asked
+        v, w = i - corner, j - corner
         dot = v[:, 0] * w[:, 0] + v[:, 1] * w[:, 1]
         cross = np.abs(v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0])  # its sign is known, its rounding must not flip it
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -40,22 +40,23 @@ def build_mesh(points: Float, ptr: Int, triangles: Int, segments: Int) -> tuple[
     Returns:
         The mesh of all triangles, and the sorted segments among ``segments`` that are not certified.
     """
-    turn = orientation(*(points[triangles[:, k]] for k in range(3)))
+    turn = orientation(*(points.take(triangles[:, k], axis=0) for k in range(3)))
     start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
     third = np.roll(triangles, -2, axis=1).reshape(-1)
     key = np.minimum(start, end) * len(points) + np.maximum(start, end)
-    order = np.argsort(key, kind="stable")
+    order = np.argsort(key)
     key = key[order]
     first = np.flatnonzero(np.diff(key, prepend=-1))
     count = np.diff(first, append=len(key))
-    left = order[first]
-    right = np.where(count > 1, order[np.minimum(first + 1, len(order) - 1)], HULL)
-    inner = right != HULL
+    inner = count > 1
+    one, other = order[first], order[np.where(inner, first + 1, first)]
+    left, right = np.minimum(one, other), np.where(inner, np.maximum(one, other), HULL)
     opposite = np.stack([third[left], np.where(inner, third[right], HULL)], 1)
     triangle = np.stack([left // 3, np.where(inner, right // 3, HULL)], 1)
     edges = np.stack([start[left], end[left]], 1)
     side = np.full(len(edges), -1, dtype=np.int8)
-    side[inner] = incircle(*(points[v[inner]] for v in (edges[:, 0], edges[:, 1], opposite[:, 0], opposite[:, 1])))
+    corners = (edges[:, 0], edges[:, 1], opposite[:, 0], opposite[:, 1])
+    side[inner] = incircle(*(points.take(v[inner], axis=0) for v in corners))
 
     used = np.zeros(len(points), dtype=bool)
     used[start] = True

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 from tensor_stereo.configs import FASTConfig
-from tensor_stereo.features.images import check_range, join_images, strongest_first, to_gray
+from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
 from tensor_stereo.features.windows import check_window_px, extract_windows
 from tensor_stereo.types import Features
 
@@ -26,8 +27,8 @@ def detect_fast(images: Tensor, config: FASTConfig | None = None) -> Features:
 
     A pixel is a corner where 9 contiguous pixels of the circle of 16 around it are all brighter, or all darker, than
     itself by more than ``threshold`` (Rosten & Drummond, "Machine learning for high-speed corner detection", ECCV
-    2006, section 2). The detector is OpenCV's; it takes one image at a time. Its suppression keeps strict maxima
-    among 8 neighbours: of two equal neighbours it keeps neither. No gradient.
+    2006, section 2). The detector is OpenCV's; it takes one image at a time, here in a pool of threads. Its suppression
+    keeps strict maxima among 8 neighbours: of two equal neighbours it keeps neither. No gradient.
 
     Args:
         images: (B, 1, H, W) or (B, 3, H, W), uint8 or floating point in [0, 1], as :func:`to_gray` takes them.
@@ -53,7 +54,7 @@ def detect_fast(images: Tensor, config: FASTConfig | None = None) -> Features:
     check_range("FASTConfig.max_keypoints", config.max_keypoints, 1, 2**31 - 1)
     check_window_px("FASTConfig.window_px", config.window_px)
     gray = to_gray(images)
-    detected = [_detect(image, config) for image in gray.cpu()[:, 0]]  # too short a step for threads to pay
+    detected = map_images(lambda image: _detect(image, config), gray.cpu())
     (keypoints, scores), ptr = join_images(detected, [(2,), ()], gray.device)
     return Features(keypoints, ptr, extract_windows(gray, keypoints, ptr, window_px=config.window_px), scores)
 
@@ -66,7 +67,7 @@ def _detect(image: Tensor, config: FASTConfig) -> tuple[Tensor, Tensor]:
         return torch.zeros(0, 2), torch.zeros(0)
     keypoints = torch.from_numpy(cv2.KeyPoint.convert(found))
     if config.nonmax_suppression:
-        scores = torch.tensor([keypoint.response for keypoint in found])
+        scores = torch.from_numpy(np.array([keypoint.response for keypoint in found], np.float32))
     else:
         scores = corner_score(image, keypoints.to(torch.int64))
     order = strongest_first(keypoints, scores, config.max_keypoints)

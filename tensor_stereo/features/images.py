@@ -95,6 +95,9 @@ def strongest_first(keypoints: Tensor, scores: Tensor, max_keypoints: int) -> Te
     >>> strongest_first(torch.tensor([[5.0, 1.0], [2.0, 1.0], [9.0, 0.0]]), torch.tensor([1.0, 1.0, 3.0]), 2)
     tensor([2, 1])
     """
+    step_x, step_y = keypoints.diff(dim=0).unbind(1)
+    if bool(((step_y > 0) | ((step_y == 0) & (step_x >= 0))).all()):  # as most detectors return them
+        return torch.argsort(scores, stable=True, descending=True)[:max_keypoints]
     order = torch.argsort(keypoints[:, 0], stable=True)
     order = order[torch.argsort(keypoints[order, 1], stable=True)]
     order = order[torch.argsort(scores[order], stable=True, descending=True)]

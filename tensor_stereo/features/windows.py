@@ -51,11 +51,12 @@ def extract_windows(images: Tensor, keypoints: Tensor, ptr: Tensor, *, window_px
     x, y = nearest.to(torch.int64).unbind(1)
 
     radius = window_px // 2
-    offsets = torch.arange(window_px, device=images.device)
-    rows = _mirror(height, radius, images.device)[y[:, None] + offsets]  # (N, window_px)
-    columns = _mirror(width, radius, images.device)[x[:, None] + offsets]
-    places = (ptr_to_batch(ptr)[:, None] * height + rows)[:, :, None] * width + columns[:, None]
-    return images.reshape(-1)[places].flatten(1).to(torch.float32)
+    rows, columns = (_mirror(length, radius, images.device) for length in (height, width))
+    padded = images[:, 0].index_select(1, rows).index_select(2, columns)
+    first = (ptr_to_batch(ptr) * len(rows) + y) * len(columns) + x  # its top left pixel
+    num_windows = padded.numel() - 2 * radius * (len(columns) + 1)
+    windows = padded.as_strided((num_windows, window_px, window_px), (1, len(columns), 1))
+    return windows.index_select(0, first).flatten(1).to(torch.float32)
 
 
 def _mirror(size: int, radius: int, device: torch.device) -> Tensor:

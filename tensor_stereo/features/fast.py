@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.configs import FASTConfig
-from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.images import check_range, join_images, strongest_first, to_gray
 from tensor_stereo.features.windows import check_window_px, extract_windows
 from tensor_stereo.types import Features
 
@@ -27,8 +27,8 @@ def detect_fast(images: Tensor, config: FASTConfig | None = None) -> Features:
 
     A pixel is a corner where 9 contiguous pixels of the circle of 16 around it are all brighter, or all darker, than
     itself by more than ``threshold`` (Rosten & Drummond, "Machine learning for high-speed corner detection", ECCV
-    2006, section 2). The detector is OpenCV's; it takes one image at a time, here in a pool of threads. Its suppression
-    keeps strict maxima among 8 neighbours: of two equal neighbours it keeps neither. No gradient.
+    2006, section 2). The detector is OpenCV's; it takes one image at a time. Its suppression keeps
+    strict maxima among 8 neighbours: of two equal neighbours it keeps neither. No gradient.
 
     Args:
         images: (B, 1, H, W) or (B, 3, H, W), uint8 or floating point in [0, 1], as :func:`to_gray` takes them.
@@ -54,7 +54,7 @@ def detect_fast(images: Tensor, config: FASTConfig | None = None) -> Features:
     check_range("FASTConfig.max_keypoints", config.max_keypoints, 1, 2**31 - 1)
     check_window_px("FASTConfig.window_px", config.window_px)
     gray = to_gray(images)
-    detected = map_images(lambda image: _detect(image, config), gray.cpu())
+    detected = [_detect(image, config) for image in gray.cpu()[:, 0]]  # a pool of threads would fight with torch's own
     (keypoints, scores), ptr = join_images(detected, [(2,), ()], gray.device)
     return Features(keypoints, ptr, extract_windows(gray, keypoints, ptr, window_px=config.window_px), scores)
 

@@ -2,18 +2,23 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <optional>
 #include <stdexcept>
 #include <tuple>
+#include <utility>
 
 #include "tensor_stereo/buffer.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
+#include "tensor_stereo/dual_edge_ratio.hpp"
 #include "tensor_stereo/gated_ssd.hpp"
 #include "tensor_stereo/one_to_one.hpp"
 #include "tensor_stereo/predicates.hpp"
 #include "tensor_stereo/row_overlap.hpp"
+#include "tensor_stereo/soft_match_graphs.hpp"
 
 namespace nb = nanobind;
 namespace ts = tensor_stereo;
@@ -23,6 +28,7 @@ namespace {
 template <class T, class... Shape>
 using Input = nb::ndarray<const T, Shape..., nb::c_contig, nb::device::cpu>;
 using Points = Input<double, nb::shape<-1, 2>>;
+using Pairs = Input<std::int64_t, nb::shape<-1, 2>>;
 using Matrix = Input<float, nb::ndim<2>>;
 using Integers = Input<std::int64_t, nb::ndim<1>>;
 using Doubles = Input<double, nb::ndim<1>>;
@@ -46,20 +52,108 @@ void check_offsets(const Integers& ptr, std::int64_t total, const char* message)
     for (std::size_t k = 1; k < size; ++k) check(ptr.data()[k - 1] <= ptr.data()[k], message);
 }
 
-auto delaunay_graph(Points points, Integers index, Integers ptr, double tie_tolerance, int num_threads) {
-    const auto num_points = static_cast<std::int64_t>(points.shape(0));
-    check_offsets(ptr, static_cast<std::int64_t>(index.shape(0)), "ptr must rise from 0 to the length of index");
+template <class T>
+auto give_rows(ts::Buffer<T> values, std::size_t rows) {
+    T* const data = values.release();
+    nb::capsule owner(data, [](void* memory) noexcept { ts::Free()(memory); });
+    return nb::ndarray<nb::numpy, T, nb::shape<-1, 2>>(data, {rows, 2}, owner);
+}
+
+auto give_pattern(ts::SparsePattern graph) {
+    const auto num_entries = static_cast<std::size_t>(graph.crow[graph.num_rows]);
+    return std::pair(give(std::move(graph.crow), graph.num_rows + 1), give(std::move(graph.cols), num_entries));
+}
+
+void check_index(const Integers& index, std::int64_t num_points) {
     for (std::size_t k = 0; k < index.shape(0); ++k) {
         check(index.data()[k] >= 0 && index.data()[k] < num_points, "index must name rows of points");
     }
+}
+
+auto delaunay_graph(Points points, Integers index, Integers ptr, double tie_tolerance, int num_threads) {
+    const auto num_points = static_cast<std::int64_t>(points.shape(0));
+    check_offsets(ptr, static_cast<std::int64_t>(index.shape(0)), "ptr must rise from 0 to the length of index");
+    check_index(index, num_points);
     ts::SparsePattern graph;
     {
         const nb::gil_scoped_release release;
         graph = ts::delaunay_graph(points.data(), num_points, index.data(), ptr.data(),
                                    static_cast<std::int64_t>(ptr.shape(0)) - 1, tie_tolerance, num_threads);
     }
-    const auto num_entries = static_cast<std::size_t>(graph.crow[num_points]);
-    return std::tuple(give(std::move(graph.crow), num_points + 1), give(std::move(graph.cols), num_entries));
+    return give_pattern(std::move(graph));
+}
+
+auto soft_match_graphs(Points points0, Points points1, Integers index, Integers ptr, double tie_tolerance,
+                       double reach_edge_lengths, double reach_px, int num_threads) {
+    const auto num_points = static_cast<std::int64_t>(points0.shape(0));
+    check(points1.shape(0) == points0.shape(0), "points0 and points1 must have the same length");
+    check_offsets(ptr, static_cast<std::int64_t>(index.shape(0)), "ptr must rise from 0 to the length of index");
+    check_index(index, num_points);
+    ts::SoftMatchGraphs found;
+    {
+        const nb::gil_scoped_release release;
+        found = ts::soft_match_graphs(points0.data(), points1.data(), num_points, index.data(), ptr.data(),
+                                      static_cast<std::int64_t>(ptr.shape(0)) - 1, tie_tolerance,
+                                      {reach_edge_lengths, reach_px}, num_threads);
+    }
+    const auto num_pairs = static_cast<std::size_t>(found.num_pairs);
+    return std::tuple(give_pattern(std::move(found.graph[0])), give_pattern(std::move(found.graph[1])),
+                      give_rows(std::move(found.pairs), num_pairs), give(std::move(found.pair_ptr), ptr.shape(0)),
+                      give_rows(std::move(found.view[0].critical), num_pairs),
+                      give_rows(std::move(found.view[1].critical), num_pairs),
+                      give(std::move(found.view[0].is_edge), num_pairs),
+                      give(std::move(found.view[1].is_edge), num_pairs));
+}
+
+auto dual_critical_points(Points points, Integers index, Integers ptr, Pairs pairs, Integers pair_ptr, int num_threads) {
+    check_offsets(ptr, static_cast<std::int64_t>(index.shape(0)), "ptr must rise from 0 to the length of index");
+    check_index(index, static_cast<std::int64_t>(points.shape(0)));
+    const std::size_t num_pairs = pairs.shape(0);
+    check(pair_ptr.shape(0) == ptr.shape(0), "pair_ptr and ptr must have the same length");
+    check_offsets(pair_ptr, static_cast<std::int64_t>(num_pairs), "pair_ptr must rise from 0 to the length of pairs");
+    ts::CriticalPairs found;
+    {
+        const nb::gil_scoped_release release;
+        found = ts::dual_critical_points(points.data(), index.data(), ptr.data(),
+                                         static_cast<std::int64_t>(ptr.shape(0)) - 1, pairs.data(), pair_ptr.data(),
+                                         num_threads);
+    }
+    return give_rows(std::move(found.critical), num_pairs);
+}
+
+ts::DualEdges dual_edges(const Points& points, const Pairs& pairs, const Pairs& critical, const Integers& ptr,
+                         double bound) {
+    const auto num_points = static_cast<std::int64_t>(points.shape(0));
+    check(critical.shape(0) == pairs.shape(0), "critical must have one row per pair");
+    check_offsets(ptr, static_cast<std::int64_t>(pairs.shape(0)), "ptr must rise from 0 to the length of pairs");
+    for (std::size_t k = 0; k < 2 * pairs.shape(0); ++k) {
+        check(pairs.data()[k] >= 0 && pairs.data()[k] < num_points, "pairs must name rows of points");
+        check(critical.data()[k] >= -2 && critical.data()[k] < num_points, "critical must name rows of points, -1 or -2");
+    }
+    return {points.data(), pairs.data(), critical.data(), ptr.data(), static_cast<std::int64_t>(ptr.shape(0)) - 1, bound};
+}
+
+auto dual_edge_ratio(Points points, Pairs pairs, Pairs critical, Integers ptr, double bound, int num_threads) {
+    const ts::DualEdges edges = dual_edges(points, pairs, critical, ptr, bound);
+    auto ratio = ts::allocate<double>(pairs.shape(0));
+    {
+        const nb::gil_scoped_release release;
+        ts::dual_edge_ratio(edges, num_threads, ratio.get());
+    }
+    return give(std::move(ratio), pairs.shape(0));
+}
+
+auto dual_edge_ratio_backward(Points points, Pairs pairs, Pairs critical, Integers ptr, Doubles ratio_gradient,
+                              double bound, int num_threads) {
+    const ts::DualEdges edges = dual_edges(points, pairs, critical, ptr, bound);
+    check(ratio_gradient.shape(0) == pairs.shape(0), "ratio_gradient must have one entry per pair");
+    auto gradient = ts::allocate<double>(2 * points.shape(0));
+    {
+        const nb::gil_scoped_release release;
+        std::fill_n(gradient.get(), 2 * points.shape(0), 0.0);
+        ts::dual_edge_ratio_backward(edges, ratio_gradient.data(), num_threads, gradient.get());
+    }
+    return give_rows(std::move(gradient), points.shape(0));
 }
 
 auto row_overlap(Integers crow0, Integers cols0, Integers crow1, Integers cols1, int num_threads) {
@@ -161,6 +255,15 @@ auto incircle(Points a, Points b, Points c, Points d) {
 NB_MODULE(_kernels, module) {
     module.def("delaunay_graph", &delaunay_graph, nb::arg("points"), nb::arg("index"), nb::arg("ptr"),
                nb::arg("tie_tolerance"), nb::arg("num_threads"));
+    module.def("soft_match_graphs", &soft_match_graphs, nb::arg("points0"), nb::arg("points1"), nb::arg("index"),
+               nb::arg("ptr"), nb::arg("tie_tolerance"), nb::arg("reach_edge_lengths"), nb::arg("reach_px"),
+               nb::arg("num_threads"));
+    module.def("dual_critical_points", &dual_critical_points, nb::arg("points"), nb::arg("index"), nb::arg("ptr"),
+               nb::arg("pairs"), nb::arg("pair_ptr"), nb::arg("num_threads"));
+    module.def("dual_edge_ratio", &dual_edge_ratio, nb::arg("points"), nb::arg("pairs"), nb::arg("critical"),
+               nb::arg("ptr"), nb::arg("bound"), nb::arg("num_threads"));
+    module.def("dual_edge_ratio_backward", &dual_edge_ratio_backward, nb::arg("points"), nb::arg("pairs"),
+               nb::arg("critical"), nb::arg("ptr"), nb::arg("ratio_gradient"), nb::arg("bound"), nb::arg("num_threads"));
     module.def("row_overlap", &row_overlap, nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
                nb::arg("num_threads"));
     module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),

@@ -7,10 +7,12 @@ tolerance e, iff its dual Voronoi edge, clipped to 1 / e edge lengths around the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError
@@ -41,39 +43,55 @@ def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads
         >>> sorted(map(tuple, np.sort(edges, axis=1).tolist()))  # no diagonal
         [(0, 1), (0, 3), (1, 2), (2, 3)]
     """
+    found = map_blocks(lambda points, ptr: _block_edges(points, ptr, tie_tolerance), points, ptr, num_threads)
+    return np.concatenate([np.empty((0, 2), dtype=np.int64), *found])
+
+
+def map_blocks(function: Callable[[Float, Int], Int], points: Float, ptr: Int, num_threads: int) -> list[Int]:
+    """Apply a function of (points, ptr) that returns point indices to runs of segments, in a pool of threads."""
+
+    def shifted(block: slice) -> Int:
+        part = ptr[block]
+        found: Int = function(points[part[0] : part[-1]], part - part[0]) + part[0]
+        return found
+
     blocks = _blocks(ptr)
     if num_threads > 1 and len(blocks) > 1:
         with ThreadPoolExecutor(num_threads) as pool:
-            found = list(pool.map(lambda block: _block_edges(points, ptr[block], tie_tolerance), blocks))
-    else:
-        found = [_block_edges(points, ptr[block], tie_tolerance) for block in blocks]
-    return np.concatenate([np.empty((0, 2), dtype=np.int64), *found])
+            return list(pool.map(shifted, blocks))
+    return [shifted(block) for block in blocks]
 
 
 def _blocks(ptr: Int) -> list[slice]:
     """Runs of segments, as slices of ptr, of about so many points that the arrays of one run stay in cache."""
     block = ptr[:-1] // _BLOCK
-    first = np.flatnonzero(np.diff(block, prepend=-1))
-    return [slice(start, stop + 1) for start, stop in zip(first, np.append(first[1:], len(block)), strict=True)]
+    first = np.append(np.flatnonzero(np.diff(block, prepend=-1)), len(block))
+    return [slice(start, stop + 1) for start, stop in pairwise(first)]
 
 
 def _block_edges(points: Float, ptr: Int, tie_tolerance: float) -> Int:
-    """Edges of consecutive segments, as pairs of global point indices."""
-    start = ptr[0]
-    points, ptr = points[start : ptr[-1]], ptr - start
+    """Edges of consecutive segments."""
+    meshes, paths = certified_meshes(points, ptr)
+    return np.concatenate([*(_long_edges(points, mesh, tie_tolerance) for mesh in meshes), paths])
+
+
+def certified_meshes(points: Float, ptr: Int) -> tuple[list[Mesh], Int]:
+    """The Delaunay triangulations of consecutive segments, and the edges (E, 2) of those that are collinear."""
     size = np.diff(ptr)
     segments = np.flatnonzero(size > 2)
     proposals = [_qhull(points[ptr[s] : ptr[s + 1]]) for s in segments]
-    edges, faulty = _certified_edges(points, ptr, proposals, segments, tie_tolerance)
-    found = [edges, ptr[:-1][size == 2][:, None] + np.array([0, 1])]
+    mesh, faulty = _build(points, ptr, proposals, segments)
+    meshes, paths = [mesh], [ptr[:-1][size == 2][:, None] + np.array([0, 1])]
     if len(faulty):
+        meshes = [_without(mesh, np.isin(np.searchsorted(ptr, mesh.edges[:, 0], side="right") - 1, faulty))]
         rebuilt = [divide_and_conquer(points[ptr[s] : ptr[s + 1]]) for s in faulty]
         flat = np.array([len(triangles) == 0 for triangles in rebuilt])
-        edges, wrong = _certified_edges(points, ptr, [t for t in rebuilt if len(t)], faulty[~flat], tie_tolerance)
+        mesh, wrong = _build(points, ptr, [t for t in rebuilt if len(t)], faulty[~flat])
         if len(wrong):
             raise RuntimeError(f"the exact triangulation of segments {wrong[:10].tolist()} fails its own proof")
-        found += [edges, *(_path(points, ptr, s) for s in faulty[flat])]
-    return np.concatenate(found) + start
+        meshes.append(mesh)
+        paths += [_path(points, ptr, s) for s in faulty[flat]]
+    return meshes, np.concatenate(paths)
 
 
 def _qhull(points: Float) -> Int:
@@ -92,19 +110,24 @@ def _path(points: Float, ptr: Int, segment: np.int64) -> Int:
     return np.stack([order[:-1], order[1:]], 1)
 
 
-def _certified_edges(
-    points: Float, ptr: Int, triangulations: Sequence[Int], segments: Int, tie_tolerance: float
-) -> tuple[Int, Int]:
-    """Graph edges of the segments whose triangulation is the Delaunay triangulation, and the other segments."""
+def _build(points: Float, ptr: Int, triangulations: Sequence[Int], segments: Int) -> tuple[Mesh, Int]:
     empty = np.empty((0, 3), dtype=np.int64)
     triangles = np.concatenate([empty, *(t + ptr[s] for t, s in zip(triangulations, segments, strict=True))])
-    mesh, faulty = build_mesh(points, ptr, triangles, segments)
+    return build_mesh(points, ptr, triangles, segments)
+
+
+def _without(mesh: Mesh, dropped: NDArray[np.bool_]) -> Mesh:
+    """A mesh without some of its edges; the triangles stay."""
+    kept = ~dropped
+    return Mesh(mesh.triangles, mesh.edges[kept], mesh.opposite[kept], mesh.triangle[kept], mesh.side[kept])
+
+
+def _long_edges(points: Float, mesh: Mesh, tie_tolerance: float) -> Int:
+    """Those edges of a triangulation that belong to the graph."""
     kept = mesh.side < 0
     if tie_tolerance > 0:
         kept &= _dual_length(points, mesh, 1 / tie_tolerance) > tie_tolerance
-    if len(faulty):
-        kept &= ~np.isin(np.searchsorted(ptr, mesh.edges[:, 0], side="right") - 1, faulty)
-    return mesh.edges[kept], faulty
+    return mesh.edges[kept]
 
 
 def _dual_length(points: Float, mesh: Mesh, bound: float) -> Float:
@@ -112,7 +135,7 @@ def _dual_length(points: Float, mesh: Mesh, bound: float) -> Float:
 
     In edge lengths, the centre of the circle through i, j and k lies cot(angle at k) / 2 from the midpoint of {i, j}.
     """
-    opposite = _canonical_opposite(points, mesh)
+    opposite = canonical_opposite(points, mesh)
     i, j = (points.take(vertex, axis=0) for vertex in mesh.edges.T)
     ends = []
     for k in opposite.T:
@@ -126,7 +149,16 @@ def _dual_length(points: Float, mesh: Mesh, bound: float) -> Float:
     return ends[0] + ends[1]
 
 
-def _canonical_opposite(points: Float, mesh: Mesh) -> Int:
+def polygons(mesh: Mesh) -> Int:
+    """(T,) number of the co-circular polygon that each triangle is part of."""
+    num_triangles = len(mesh.triangles)
+    a, b = mesh.triangle[mesh.side == 0].T
+    graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(num_triangles, num_triangles))
+    polygon: Int = connected_components(graph, directed=False)[1].astype(np.int64)
+    return polygon
+
+
+def canonical_opposite(points: Float, mesh: Mesh) -> Int:
     """Opposite vertices that depend on the points alone.
 
     The triangulation of a co-circular polygon is arbitrary, and its vertices give the same circle but for rounding:
@@ -135,12 +167,8 @@ def _canonical_opposite(points: Float, mesh: Mesh) -> Int:
     tied = mesh.side == 0
     if not tied.any():
         return mesh.opposite
-    num_triangles = len(mesh.triangles)
-    a, b = mesh.triangle[tied].T
-    graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(num_triangles, num_triangles))
-    polygon = connected_components(graph, directed=False)[1]  # (T,)
-
-    several = np.unique([a, b])  # triangles that share a polygon with another one
+    polygon = polygons(mesh)
+    several = np.unique(mesh.triangle[tied])  # triangles that share a polygon with another one
     member, vertex = np.repeat(polygon[several], 3), mesh.triangles[several].reshape(-1)
     order = np.lexsort((points[vertex, 1], points[vertex, 0], member))
     member, vertex = member[order], vertex[order]

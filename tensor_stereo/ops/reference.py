@@ -229,3 +229,50 @@ def _blocks(counts: Tensor) -> Iterator[tuple[int, int]]:
     for size in sizes.tolist():
         start, stop = stop, stop + size
         yield start, stop
+
+
+def dual_edge_ratio(points: Tensor, pairs: Tensor, critical: Tensor, bound: float) -> Tensor:
+    """Signed lengths of dual Voronoi edges, with autograd; see :func:`tensor_stereo.ops.dual_edge_ratio`."""
+    ends = []
+    for k in critical.unbind(1):
+        along, across, is_free = _dual_end(points, pairs, k, bound)
+        with torch.no_grad():
+            end = (along / across).nan_to_num(bound, posinf=bound, neginf=-bound).clamp(-bound, bound)
+            clipped = torch.where(k == -1, bound, end)
+        # masked before the division, because where() would turn an unused 0 / 0 into a NaN gradient
+        ends.append(torch.where(is_free, along / torch.where(is_free, across, 1), clipped))
+    return torch.where(critical[:, 1] == -2, -2 * bound, ends[0] + ends[1])
+
+
+def dual_edge_ratio_backward(points: Tensor, pairs: Tensor, critical: Tensor, gradient: Tensor, bound: float) -> Tensor:
+    """Gradient of :func:`dual_edge_ratio` with respect to the points, written out.
+
+    With q = p_k - p_i, d = p_j - p_i and J the rotation by 90 degrees, an end is q.(q - d) / 2 |d x q|.
+    """
+    result = torch.zeros_like(points)
+    i, j = pairs.unbind(1)
+    d = points[j] - points[i]
+    for side, k in zip((-1, 1), critical.unbind(1), strict=True):
+        along, across, is_free = _dual_end(points, pairs, k, bound)
+        q = points[k.clamp(min=0)] - points[i]
+        across = torch.where(is_free, across, 1)[:, None]
+        scale = torch.where(is_free, gradient, 0)[:, None] / across
+        turn = 2 * side * along[:, None] / across
+        of_k = scale * (2 * q - d - turn * _rotate(d))
+        of_j = scale * (turn * _rotate(q) - q)
+        for index, part in ((k.clamp(min=0), of_k), (j, of_j), (i, -of_k - of_j)):
+            result.index_add_(0, index, part)
+    return result
+
+
+def _dual_end(points: Tensor, pairs: Tensor, k: Tensor, bound: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Numerator and denominator of the ends towards k, and which are finite and not clipped."""
+    i = points[pairs[:, 0]]
+    dx, dy = (points[pairs[:, 1]] - i).unbind(1)
+    x, y = (points[k.clamp(min=0)] - i).unbind(1)
+    along, across = x * (x - dx) + y * (y - dy), 2 * (dx * y - dy * x).abs()
+    return along, across, (k >= 0) & ((along / across).detach().abs() < bound)
+
+
+def _rotate(vectors: Tensor) -> Tensor:
+    return torch.stack([-vectors[:, 1], vectors[:, 0]], 1)

@@ -13,7 +13,12 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def operator(fake: Callable[..., Any]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def operator(
+    fake: Callable[..., Any],
+    *,
+    backward: Callable[..., Any] | None = None,
+    setup_context: Callable[..., Any] | None = None,
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Register a function on plain tensors under its own name in the namespace ``tensor_stereo``.
 
     The registered operator stands behind ``torch.ops.tensor_stereo``; it is what compilers and tensor subclasses see.
@@ -22,16 +27,21 @@ def operator(fake: Callable[..., Any]) -> Callable[[Callable[P, R]], Callable[P,
     Args:
         fake: makes empty results of the right shape from the same positional arguments; those that no shape depends on
             may be swallowed by ``*_``.
+        backward: gradient of the arguments from (context, gradient of the results), as ``register_autograd`` takes it.
+            An operator with a gradient always goes through the dispatcher.
+        setup_context: fills the context from (context, arguments, results).
     """
 
     def register(function: Callable[P, R]) -> Callable[P, R]:
         registered = torch.library.custom_op(f"tensor_stereo::{function.__name__}", function, mutates_args=())
         registered.register_fake(fake)
+        if backward is not None:
+            registered.register_autograd(backward, setup_context=setup_context)
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             plain = all(type(value) is Tensor or not isinstance(value, Tensor) for value in args)
-            if torch.compiler.is_compiling() or not plain or kwargs:
+            if backward is not None or torch.compiler.is_compiling() or not plain or kwargs:
                 result: R = registered(*args, **kwargs)
                 return result
             return function(*args, **kwargs)

@@ -1,0 +1,111 @@
+// The points that bound the dual Voronoi edge of a pair of points.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <vector>
+
+#include "tensor_stereo/graph_edges.hpp"
+#include "tensor_stereo/triangulation.hpp"
+
+namespace tensor_stereo {
+
+inline constexpr Index kBlocked = -2;
+
+// How negative a signed dual length may get before the pair counts as blocked: the sum of both parts.
+struct Reach {
+    double edge_lengths, px;
+};
+
+// Signed distance of the centre of the circle through i, j and k from the midpoint of {i, j}, towards k, in lengths of
+// {i, j}. The one expression that every back end evaluates; rounding cannot change the side on which k lies.
+inline double dual_end(Point i, Point j, Point k) noexcept {
+    const double dx = j.x - i.x, dy = j.y - i.y, x = k.x - i.x, y = k.y - i.y;
+    return (x * (x - dx) + y * (y - dy)) / (2 * std::fabs(dx * y - dy * x));
+}
+
+// Of all points on one side of the line from i to j, the one that sees the segment under the largest angle: the circle
+// through i, j and it has no other point of its side strictly inside. Of several the lexicographically first.
+struct Critical {
+    Index right, left;  // kNone: no point on that side; both kBlocked: a point lies between i and j, or out of reach
+    bool is_edge;       // of the graph
+
+    Critical reversed() const noexcept { return {left, right, is_edge}; }
+};
+
+// Finds them for pairs of points of one segment. If {i, j} is an edge of the mesh they are its opposite vertices;
+// otherwise they are among the vertices of the triangles that the segment from i to j crosses, since the constrained
+// Delaunay triangulation with that segment only changes these (Anglada, Computers & Graphics 21 (1997), section 3).
+class CriticalPoints {
+   public:
+    explicit CriticalPoints(Reach reach) : reach_(reach) {}
+
+    // Both must live on and stay as they are.
+    void prepare(const Triangulation& mesh, const GraphEdges& edges);
+
+    // Vertices are numbered as in the input of the triangulation, i != j.
+    Critical find(Index i, Index j);
+
+    // Those of an edge of the mesh, right and left of half-edge h, as far as they may be.
+    Critical of_half_edge(Index h) const { return to_input(between(h)); }
+
+    // The same, blocked if out of reach; rounding can do that to an edge between needles.
+    Critical in_reach(Index h, Critical found) const noexcept;
+
+    // Whether the critical points of an edge of the exact graph, right and left of its half-edge h, see each other across
+    // it: they are the pair that takes its place when it vanishes.
+    bool cross(Index h, const Critical& found) const noexcept;
+
+    // The critical points of that pair, seen from right to left, if it is plain that they are the ends of the edge.
+    bool across(Index h, Critical& found) const noexcept;
+
+   private:
+    // An end of a dual edge, and a bound on its rounding.
+    struct End {
+        double value, error;
+
+        double above() const noexcept { return value + error; }
+    };
+
+    // The vertices on one side of a way through the mesh.
+    struct Chain {
+        struct Link {
+            Index vertex, beyond;  // and the half-edge outside the chain's edge that leads to it
+        };
+
+        void start(Index vertex, Index beyond, const End& end) {
+            links.clear();
+            best = 0;
+            best_end = end;
+            any_tie = false;
+            links.push_back({vertex, beyond});
+        }
+
+        std::vector<Link> links;
+        std::size_t best;  // sees the segment under the largest angle
+        End best_end;      // its dual end
+        bool any_tie;      // others are as good
+    };
+
+    Critical to_input(Critical found) const noexcept;
+    Critical find_in_mesh(Index i, Index j);
+    Critical between(Index h) const;
+    Critical walk(Index i, Index j, Index h);
+    void add(Chain& chain, Index i, Index j, Index vertex, Index beyond, const End& end) const;
+    Index first_of_best(Index i, Index j, const Chain& chain) const;
+    Index first_of_polygon(Index h, Index first) const;
+    double reach(Index i, Index j) const noexcept;
+    bool is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept;
+    double end(Index i, Index j, Index k) const noexcept;
+    bool is_before(Index v, Index w) const noexcept;
+    int turn(Index a, Index b, Index c) const noexcept;
+
+    Reach reach_;
+    const Triangulation* mesh_ = nullptr;
+    const GraphEdges* edges_ = nullptr;
+    std::vector<Index> fan_;   // of each vertex the half-edge from it that comes first counter-clockwise
+    std::vector<Index> rank_;  // number in the mesh of each vertex of the input
+    Chain left_, right_;
+};
+
+}  // namespace tensor_stereo

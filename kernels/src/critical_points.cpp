@@ -1,0 +1,227 @@
+#include "tensor_stereo/critical_points.hpp"
+
+#include <cmath>
+#include <cstdlib>
+
+namespace tensor_stereo {
+void CriticalPoints::prepare(const Triangulation& mesh, const GraphEdges& edges) {
+    mesh_ = &mesh;
+    edges_ = &edges;
+    const auto count = static_cast<Index>(mesh.vertex.size());
+    rank_.resize(count);
+    for (Index v = 0; v < count; ++v) rank_[mesh.vertex[v]] = v;
+    if (mesh.is_collinear) return;
+    fan_.resize(count);
+    const auto half_edges = static_cast<Index>(mesh.origin.size());
+    for (Index h = 0; h < half_edges; ++h) fan_[mesh.origin[h]] = h;
+    for (Index h = 0; h < half_edges; ++h) {
+        if (mesh.twin[h] == kNone) fan_[mesh.origin[h]] = h;
+    }
+}
+
+Critical CriticalPoints::find(Index i, Index j) {
+    const Index a = rank_[i], b = rank_[j];
+    if (mesh_->is_collinear) {  // numbered along the line
+        const bool is_edge = std::abs(a - b) == 1;
+        return {is_edge ? kNone : kBlocked, is_edge ? kNone : kBlocked, is_edge};
+    }
+    return find_in_mesh(a, b);
+}
+
+Critical CriticalPoints::to_input(Critical found) const noexcept {
+    if (found.right >= 0) found.right = mesh_->vertex[found.right];
+    if (found.left >= 0) found.left = mesh_->vertex[found.left];
+    return found;
+}
+
+bool CriticalPoints::cross(Index h, const Critical& found) const noexcept {
+    const Index i = mesh_->origin[h], j = mesh_->origin[next_in_triangle(h)];
+    const Index k = rank_[found.right], l = rank_[found.left];
+    return turn(k, l, i) > 0 && turn(k, l, j) < 0;
+}
+
+bool CriticalPoints::across(Index h, Critical& found) const noexcept {
+    const Index* const origin = mesh_->origin.data();
+    const Index twin = mesh_->twin[h];
+    const Index sides[4] = {previous_in_triangle(h), next_in_triangle(twin), next_in_triangle(h), previous_in_triangle(twin)};
+    const Index i = origin[h], j = origin[twin], k = origin[sides[3]], l = origin[sides[0]];
+    const Point* const p = mesh_->points.data();
+    for (int side = 0; side < 4; ++side) {
+        if (edges_->state(sides[side]) == GraphEdges::kTie) return false;
+        const Index beyond = mesh_->twin[sides[side]];
+        if (beyond == kNone) continue;
+        const Point q = p[origin[previous_in_triangle(beyond)]];
+        const int inside = side < 2 ? incircle(p[k], p[l], p[i], q, mesh_->bounds) : incircle(p[l], p[k], p[j], q, mesh_->bounds);
+        if (inside == 0) return false;
+    }
+    found = {mesh_->vertex[j], mesh_->vertex[i], false};
+    if (is_out_of_reach(k, l, j, i)) found = {kBlocked, kBlocked, false};
+    return true;
+}
+
+Critical CriticalPoints::find_in_mesh(Index i, Index j) {
+    const Index* const origin = mesh_->origin.data();
+    const Index* const twin = mesh_->twin.data();
+    const Index first = fan_[i];
+    for (Index h = first;;) {
+        if (origin[next_in_triangle(h)] == j) return in_reach(h, of_half_edge(h));
+        const Index back = previous_in_triangle(h);
+        if (twin[back] == kNone) {
+            if (origin[back] == j) return in_reach(back, of_half_edge(back)).reversed();
+            break;
+        }
+        h = twin[back];
+        if (h == first) break;
+    }
+    const Point p = mesh_->points[i], q = mesh_->points[j];
+    const auto is_ahead = [&](Index v) {
+        const Point r = mesh_->points[v];
+        return p.x == q.x ? (r.y > p.y) == (q.y > p.y) : (r.x > p.x) == (q.x > p.x);
+    };
+    int right = turn(i, origin[next_in_triangle(first)], j);
+    if (right == 0 && is_ahead(origin[next_in_triangle(first)])) return {kBlocked, kBlocked, false};
+    for (Index h = first;;) {
+        const Index back = previous_in_triangle(h);
+        const int left = turn(i, origin[back], j);
+        if (left == 0 && is_ahead(origin[back])) return {kBlocked, kBlocked, false};
+        if (right > 0 && left < 0) return to_input(walk(i, j, h));
+        right = left;
+        h = twin[back];
+    }
+}
+
+// The pair is half-edge h.
+Critical CriticalPoints::between(Index h) const {
+    const auto side = [this](Index g) {
+        return g == kNone ? kNone : first_of_polygon(g, mesh_->origin[previous_in_triangle(g)]);
+    };
+    return {side(mesh_->twin[h]), side(h), edges_->state(h) == GraphEdges::kLong};
+}
+
+Critical CriticalPoints::in_reach(Index h, Critical found) const noexcept {
+    if (found.right == kNone || found.left == kNone) return found;
+    const Index i = mesh_->origin[h], j = mesh_->origin[next_in_triangle(h)];
+    return is_out_of_reach(i, j, rank_[found.right], rank_[found.left]) ? Critical{kBlocked, kBlocked, found.is_edge} : found;
+}
+
+// From i through the triangle of h, whose inside the segment enters, to j.
+Critical CriticalPoints::walk(Index i, Index j, Index h) {
+    const Index* const origin = mesh_->origin.data();
+    const Index* const twin = mesh_->twin.data();
+    const Point p = mesh_->points[i], q = mesh_->points[j];
+    const double dx = q.x - p.x, dy = q.y - p.y, span = std::fabs(dx) + std::fabs(dy);
+    const double out_of_reach = -(1 + 1e-9) * reach(i, j);  // beyond doubt
+    double cross = 0;  // of the vector to j and that to the point looked at
+    const auto look = [&](Index k) -> End {
+        const double x = mesh_->points[k].x - p.x, y = mesh_->points[k].y - p.y;
+        cross = dx * y - dy * x;
+        const double inverse = 1 / std::fabs(cross), value = 0.5 * inverse * (x * (x - dx) + y * (y - dy));
+        const double size = std::fabs(x) + std::fabs(y);
+        return {value, 1e-15 * inverse * size * (size + (1 + 2 * std::fabs(value)) * span)};
+    };
+    const Index first_right = origin[next_in_triangle(h)], first_left = origin[previous_in_triangle(h)];
+    right_.start(first_right, twin[h], look(first_right));
+    left_.start(first_left, twin[previous_in_triangle(h)], look(first_left));
+    h = twin[next_in_triangle(h)];
+    while (true) {  // the segment enters a triangle through h, which runs from the left chain to the right one
+        if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return {kBlocked, kBlocked, false};
+        const Index to_left = previous_in_triangle(h), to_right = next_in_triangle(h);
+        const Index apex = origin[to_left];
+        if (apex == j) {
+            left_.links.push_back({j, twin[to_left]});
+            right_.links.push_back({j, twin[to_right]});
+            break;
+        }
+        const End apex_end = look(apex);
+        int side = sign(cross);
+        if (std::fabs(cross) <= mesh_->bounds.orientation) side = turn(i, j, apex);
+        if (side == 0) return {kBlocked, kBlocked, false};
+        if (side > 0) {
+            add(left_, i, j, apex, twin[to_left], apex_end);
+            h = twin[to_right];
+        } else {
+            add(right_, i, j, apex, twin[to_right], apex_end);
+            h = twin[to_left];
+        }
+    }
+    const Critical found{first_of_best(j, i, right_), first_of_best(i, j, left_), false};
+    return is_out_of_reach(i, j, found.right, found.left) ? Critical{kBlocked, kBlocked, false} : found;
+}
+
+// Appends to the left or the right chain; rounding decides nothing.
+void CriticalPoints::add(Chain& chain, Index i, Index j, Index vertex, Index beyond, const End& end) const {
+    const bool is_left = &chain == &left_;
+    const double gain = chain.best_end.value - end.value;
+    int inside = sign(gain);
+    if (!(std::fabs(gain) > chain.best_end.error + end.error)) {
+        const Point* const p = mesh_->points.data();
+        const Index best = chain.links[chain.best].vertex;
+        inside = is_left ? incircle(p[i], p[j], p[best], p[vertex], mesh_->bounds)
+                         : incircle(p[j], p[i], p[best], p[vertex], mesh_->bounds);
+    }
+    chain.links.push_back({vertex, beyond});
+    if (inside > 0) {
+        chain.best = chain.links.size() - 1;
+        chain.best_end = end;
+        chain.any_tie = false;
+    } else if (inside == 0) {
+        chain.any_tie = true;
+    }
+}
+
+// Of the best vertices of a chain on the left of i -> j, and of all others on their circle, the first.
+Index CriticalPoints::first_of_best(Index i, Index j, const Chain& chain) const {
+    const Point* const p = mesh_->points.data();
+    const std::size_t last = chain.links.size() - 1;  // an end of the segment
+    const Index apex = chain.links[chain.best].vertex;
+    const auto is_on_circle = [&](Index v) { return incircle(p[i], p[j], p[apex], p[v], mesh_->bounds) == 0; };
+    Index first = apex;
+    bool before_on_circle = true;  // the other end of the segment
+    for (std::size_t k = 0; k <= last; ++k) {
+        const auto [v, beyond] = chain.links[k];
+        const bool on_circle = k == chain.best || k == last || (chain.any_tie && is_on_circle(v));
+        if (on_circle && k != last && is_before(v, first)) first = v;
+        if (on_circle && before_on_circle && beyond != kNone && is_on_circle(mesh_->origin[previous_in_triangle(beyond)])) {
+            first = first_of_polygon(beyond, first);
+        }
+        before_on_circle = on_circle;
+    }
+    return first;
+}
+
+// The first of a vertex and those of a co-circular polygon on the inner side of its half-edge h.
+Index CriticalPoints::first_of_polygon(Index h, Index first) const {
+    const Index apex = mesh_->origin[previous_in_triangle(h)];
+    if (is_before(apex, first)) first = apex;
+    for (const Index side : {next_in_triangle(h), previous_in_triangle(h)}) {
+        if (edges_->state(side) == GraphEdges::kTie) first = first_of_polygon(mesh_->twin[side], first);
+    }
+    return first;
+}
+
+double CriticalPoints::reach(Index i, Index j) const noexcept {
+    const double dx = mesh_->points[j].x - mesh_->points[i].x, dy = mesh_->points[j].y - mesh_->points[i].y;
+    return reach_.edge_lengths + reach_.px / std::sqrt(dx * dx + dy * dy);
+}
+
+// Whether the dual of {i, j} is too negative, always computed from the vertex that comes first in the input.
+bool CriticalPoints::is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept {
+    if (mesh_->vertex[i] > mesh_->vertex[j]) return is_out_of_reach(j, i, left, right);
+    const double limit = reach(i, j);
+    return !std::isinf(limit) && !(end(i, j, left) + end(i, j, right) >= -limit);
+}
+
+double CriticalPoints::end(Index i, Index j, Index k) const noexcept {
+    return dual_end(mesh_->points[i], mesh_->points[j], mesh_->points[k]);
+}
+
+bool CriticalPoints::is_before(Index v, Index w) const noexcept {
+    const Point p = mesh_->points[v], q = mesh_->points[w];
+    return p.x < q.x || (p.x == q.x && p.y < q.y);
+}
+
+int CriticalPoints::turn(Index a, Index b, Index c) const noexcept {
+    return orientation(mesh_->points[a], mesh_->points[b], mesh_->points[c], mesh_->bounds);
+}
+
+}  // namespace tensor_stereo

@@ -1,0 +1,102 @@
+"""From the tensors of a ragged batch to the arrays that graph builders take."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tensor_stereo.configs import Backend
+from tensor_stereo.duplicates import coincident_ids, keep_one_to_one
+from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.types import check_integer, check_points, check_ptr, check_vector
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+SMALLEST, LARGEST = 1e-60, 1e60  # magnitudes whose degree-4 determinants neither underflow nor overflow
+
+
+def segments_of(ptr: Tensor, group: Tensor, num_rows: int) -> Int:
+    """(M,) int64 number of the segment, an object group within a pair, of every row."""
+    check_vector("group", group, num_rows)
+    check_integer("group", group)
+    pair = pair_of(ptr)
+    labels = group.detach().to("cpu", torch.int64).numpy()
+    order = np.lexsort((labels, pair))
+    differs = (np.diff(labels[order]) != 0) | (np.diff(pair[order]) != 0)
+    segment = np.zeros(num_rows, dtype=np.int64)
+    segment[order[1:]] = np.cumsum(differs)
+    return segment
+
+
+def check_options(tie_tolerance: float, backend: str) -> Backend:
+    """The back end that shall run; raises for unknown options."""
+    if not 0 <= tie_tolerance < 1:
+        raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
+    return resolve_backend(backend)  # type: ignore[arg-type]
+
+
+def pair_of(ptr: Tensor) -> Int:
+    """(M,) number of the pair of every row."""
+    length = np.diff(ptr.numpy(force=True))
+    return np.repeat(np.arange(len(length)), length)
+
+
+def to_points(name: str, keypoints: Tensor, ptr: Tensor) -> Float:
+    """Keypoints as a float64 array; raises for what the exact predicates cannot take, naming pair and row."""
+    check_points(name, keypoints)
+    check_ptr("ptr", ptr, len(keypoints))
+    points: Float = keypoints.detach().to("cpu", torch.float64).contiguous().numpy()
+    row = _first_out_of_range(points)
+    if row >= 0:
+        pair = int(torch.searchsorted(ptr.cpu(), row, right=True)) - 1
+        where = f"row {row - int(ptr[pair])} of pair {pair}"
+        given = tuple(points[row].tolist())
+        raise ValueError(f"{name} must be finite, 0 or {SMALLEST:g}..{LARGEST:g} in magnitude, got {given} in {where}")
+    return points
+
+
+def _first_out_of_range(points: Float) -> int:
+    if kernels is not None:
+        return int(kernels.first_point_out_of_range(points))
+    magnitude = np.abs(points)
+    bad = ~((magnitude == 0) | ((magnitude >= SMALLEST) & (magnitude <= LARGEST))).all(1)
+    return int(bad.argmax()) if bad.any() else -1
+
+
+def one_to_one(views: list[Float], ptr: Tensor, cost: Tensor | None, backend: Backend) -> Bool:
+    """(M,) the rows that are vertices, as :func:`tensor_stereo.graphs.build_match_graphs` documents them."""
+    values = None if cost is None else cost.detach().to("cpu", torch.float64).contiguous().numpy()
+    if values is not None and np.isnan(values).any():
+        raise ValueError(f"cost must not be NaN, got NaN in row {int(np.isnan(values).argmax())}")
+    kept: Bool
+    if backend == "native" and kernels is not None:
+        kept = kernels.one_to_one(*views, ptr.numpy(force=True), values, torch.get_num_threads())
+        return kept
+    pair = pair_of(ptr)
+    ids0, ids1 = (coincident_ids(points, pair) for points in views)
+    kept = keep_one_to_one(ids0, ids1, values)
+    return kept
+
+
+def group_size_of(ptr: Tensor, segment: Int | None, kept: Bool) -> Tensor:
+    """(M,) int64 vertices in the segment of every row, 0 for rows that are none."""
+    # NumPy, because torch would wake its threads for this, and they would spin beside the kernels' own.
+    if segment is None and kept.all():
+        length = np.diff(ptr.numpy(force=True))
+        return torch.from_numpy(np.repeat(length, length))
+    segment = pair_of(ptr) if segment is None else segment
+    return torch.from_numpy(np.bincount(segment, weights=kept).astype(np.int64)[segment] * kept)
+
+
+def vertices_of(ptr: Tensor, segment: Int | None, kept: Bool) -> tuple[Int, Int]:
+    """Rows that are vertices, segment after segment, and the offsets of the segments."""
+    if segment is None and kept.all():
+        return np.arange(len(kept)), ptr.numpy(force=True)
+    vertex = np.flatnonzero(kept)
+    number = (pair_of(ptr) if segment is None else segment)[vertex]
+    vertex = vertex[np.argsort(number, kind="stable")]
+    return vertex, np.concatenate([[0], np.cumsum(np.bincount(number))])

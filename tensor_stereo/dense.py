@@ -1,0 +1,99 @@
+"""Dense disparity maps: a grid of their pixels as matches, and the filter's verdict on each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.filters import FilterOutput
+from tensor_stereo.modules import DelaunayFilter
+from tensor_stereo.types import Matches
+
+
+class FilteredDisparity(NamedTuple):
+    """Verdicts on the grid of B disparity maps; H' = ceil(H / stride), W' = ceil(W / stride).
+
+    Attributes:
+        inlier: (B, 1, H', W') bool; False where there is no match.
+        score: (B, 1, H', W') in [0, 1], higher is better; 0 where there is no match.
+        mask: (B, 1, H', W') bool, grid points that are matches: known, not masked out, and inside view 1.
+        grid: (H', W', 2) their (x, y) in px of view 0.
+    """
+
+    inlier: Tensor
+    score: Tensor
+    mask: Tensor
+    grid: Tensor
+
+
+def filter_disparity(
+    disparity: Tensor,
+    stride: int,
+    *,
+    filter: Callable[[Matches], FilterOutput] | None = None,  # noqa: A002
+    mask: Tensor | None = None,
+) -> FilteredDisparity:
+    """Decide for every grid point of a disparity map whether its neighbours in the grid stay its neighbours in view 1.
+
+    The point (x, y) and its disparity d are the match (x, y) -> (x - d, y). The result stays on the grid, because the
+    pixels between were not looked at; it belongs to ``disparity[..., ::stride, ::stride]``. Points that meet in view 1
+    at the same place hide each other: the largest disparity, which is the nearest surface, is taken and the others are
+    no inliers. A region that is wrong as a whole, shifted by one constant, looks like an object and is kept inside.
+
+    Args:
+        disparity: (B, 1, H, W) float32 or float64, x0 - x1 in px, of any sign. NaN and infinite values are no matches,
+            nor are those whose partner lies outside columns 0..W - 1.
+        stride: distance of the grid's points in px, at least 1. The grid starts at pixel (0, 0).
+        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()``.
+        mask: (B, 1, H, W) bool; where it is False, disparities are no matches. None means all.
+
+    Returns:
+        Verdicts on the grid, each map by itself. If the filter's score is differentiable, gradients flow from it to the
+        disparities of the matches; they are 0 elsewhere.
+
+    Raises:
+        ValueError: if shapes are others, ``stride`` is below 1, or a partner's column is below 1e-60 px without being 0
+            (float64 only).
+        TypeError: if ``disparity`` is neither float32 nor float64, or ``mask`` is not bool.
+
+    Example:
+        >>> disparity = torch.full((1, 1, 32, 32), 3.0)
+        >>> result = filter_disparity(disparity, 8)
+        >>> result.inlier[0, 0]
+        tensor([[False,  True,  True,  True],
+                [False,  True,  True,  True],
+                [False,  True,  True,  True],
+                [False,  True,  True,  True]])
+    """
+    if disparity.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"disparity must be float32 or float64, got {disparity.dtype}")
+    if disparity.ndim != 4 or disparity.shape[1] != 1:
+        raise ValueError(f"disparity must have shape (B, 1, H, W), got {tuple(disparity.shape)}")
+    if stride < 1:
+        raise ValueError(f"stride must be at least 1 px, got {stride}")
+    if mask is not None and mask.dtype != torch.bool:
+        raise TypeError(f"mask must be bool, got {mask.dtype}")
+    if mask is not None and mask.shape != disparity.shape:
+        raise ValueError(f"mask must have the shape {tuple(disparity.shape)} of disparity, got {tuple(mask.shape)}")
+    height, width = disparity.shape[2:]
+    rows = torch.arange(0, height, stride, dtype=disparity.dtype, device=disparity.device)
+    columns = torch.arange(0, width, stride, dtype=disparity.dtype, device=disparity.device)
+    grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)  # (H', W', 2)
+    sampled = disparity[:, 0, ::stride, ::stride]  # (B, H', W')
+    partner = grid[..., 0] - sampled.detach()
+    found = (partner >= 0) & (partner <= width - 1)  # False for NaN and infinity
+    if mask is not None:
+        found &= mask[:, 0, ::stride, ::stride]
+    # Select before computing: a NaN that meets the graph would back-propagate.
+    values = sampled[found]  # (M,)
+    keypoints0 = grid.expand(*found.shape, 2)[found]
+    keypoints1 = torch.stack([keypoints0[:, 0] - values, keypoints0[:, 1]], dim=1)
+    ptr = lengths_to_ptr(found.sum((1, 2)))
+    output = (DelaunayFilter() if filter is None else filter)(Matches(keypoints0, keypoints1, ptr, -values.detach()))
+    inlier = torch.zeros_like(found).masked_scatter(found, output.inlier)
+    score = torch.zeros_like(found, dtype=output.score.dtype).masked_scatter(found, output.score)
+    return FilteredDisparity(inlier[:, None], score[:, None], found[:, None], grid)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tensor_stereo.evaluation import score_dataset as score_dataset
-    from tensor_stereo.filters import DelaunayFilter as DelaunayFilter
     from tensor_stereo.filters import classify_matches as classify_matches
     from tensor_stereo.graphs import build_graphs as build_graphs
+    from tensor_stereo.modules import DelaunayFilter as DelaunayFilter
     from tensor_stereo.types import Adjacency as Adjacency
     from tensor_stereo.types import Classification as Classification
     from tensor_stereo.types import Features as Features
@@ -23,7 +23,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Adjacency": "types",
     "Classification": "types",
-    "DelaunayFilter": "filters",
+    "DelaunayFilter": "modules",
     "Features": "types",
     "Matches": "types",
     "Relation": "types",

@@ -197,7 +197,7 @@ def split_features(features: Features) -> list[Features]:
     [[0.0], [1.0, 2.0]]
     """
     columns = (features.keypoints, features.descriptors, features.scores)
-    parts = zip(*(column.split(features.ptr.diff().tolist()) for column in columns), strict=True)
+    parts = zip(*(split(column, features.ptr) for column in columns), strict=True)
     return [
         Features(keypoints, features.ptr.new_tensor([0, len(keypoints)]), descriptors, scores)
         for keypoints, descriptors, scores in parts

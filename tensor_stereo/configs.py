@@ -7,6 +7,7 @@ from typing import Literal
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
+TemperatureUnit = Literal["edge", "px"]
 Backend = Literal["auto", "native", "scipy"]
 
 DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4

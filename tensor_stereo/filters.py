@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tensor_stereo import ops
-from tensor_stereo.batching import from_padded
+from tensor_stereo.batching import select_matches
 from tensor_stereo.configs import Backend, Restriction
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.relations import shared_neighbors
@@ -80,88 +79,24 @@ def classify_graphs(
     return Classification(inlier, relation, overlap, degree0, degree1)
 
 
-class FilterOutput(NamedTuple):
-    """Verdicts in the layout of the input: (B, N) for padded keypoints; False and UNTESTED in the padding."""
+@dataclass(frozen=True, eq=False)
+class FilterOutput:
+    """Verdicts and scores in the layout of the input: (B, N) for padded keypoints, (M,) for :class:`Matches`.
 
-    inlier: Tensor
-    relation: Tensor
-
-
-class DelaunayFilter(nn.Module):
-    """:func:`classify_matches` for padded keypoints, as a module without parameters.
-
-    Args:
-        restriction: as in :func:`classify_matches`.
-        min_group_size: as in :func:`classify_matches`.
-        tie_tolerance: as in :func:`classify_matches`.
-        backend: as in :func:`classify_matches`.
-
-    Example:
-        >>> left = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(0)) * 100
-        >>> right = left - torch.tensor([5.0, 0.0])
-        >>> DelaunayFilter()(left, right).inlier.all()
-        tensor(True)
+    Attributes:
+        inlier: bool; False for untested matches and in the padding.
+        score: in [0, 1], higher is better; 0 for untested matches and in the padding.
+        relation: int8 values of :class:`Relation`, UNTESTED in the padding.
+        matches: the M real matches of the input, as one ragged batch.
+        mask: (B, N) bool, the places of ``matches`` in the layout; None for ragged input.
     """
 
-    def __init__(
-        self,
-        *,
-        restriction: Restriction = "cardinality",
-        min_group_size: int = 4,
-        tie_tolerance: float = 1e-3,
-        backend: Backend = "auto",
-    ) -> None:
-        super().__init__()
-        self.restriction = restriction
-        self.min_group_size = min_group_size
-        self.tie_tolerance = tie_tolerance
-        self.backend = backend
+    inlier: Tensor
+    score: Tensor
+    relation: Tensor
+    matches: Matches
+    mask: Tensor | None = None
 
-    def forward(
-        self,
-        keypoints0: Tensor,
-        keypoints1: Tensor,
-        mask: Tensor | None = None,
-        group: Tensor | None = None,
-        cost: Tensor | None = None,
-    ) -> FilterOutput:
-        """Classify padded pairs.
-
-        Args:
-            keypoints0: (B, N, 2) px of view 0.
-            keypoints1: (B, N, 2) px of view 1; row i of both is one match.
-            mask: (B, N) bool, True for real matches; None means all.
-            group: (B, N) integer object groups.
-            cost: (B, N), lower is better.
-
-        Returns:
-            ``inlier`` (B, N) bool and ``relation`` (B, N) int8. No gradient.
-
-        Raises:
-            ValueError: if shapes disagree, or as :func:`classify_matches`.
-        """
-        if keypoints0.ndim != 3 or keypoints0.shape[2] != 2:
-            raise ValueError(f"keypoints0 must have shape (B, N, 2), got {tuple(keypoints0.shape)}")
-        for name, value, shape in (
-            ("keypoints1", keypoints1, keypoints0.shape),
-            ("mask", mask, keypoints0.shape[:2]),
-            ("group", group, keypoints0.shape[:2]),
-            ("cost", cost, keypoints0.shape[:2]),
-        ):
-            if value is not None and value.shape != shape:
-                raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(value.shape)}")
-        rows0, ptr = from_padded(keypoints0, mask)
-        rows1, cost, group = (None if v is None else from_padded(v, mask)[0] for v in (keypoints1, cost, group))
-        result = classify_matches(
-            Matches(rows0, rows1, ptr, cost, group),  # type: ignore[arg-type]
-            restriction=self.restriction,
-            min_group_size=self.min_group_size,
-            tie_tolerance=self.tie_tolerance,
-            backend=self.backend,
-        )
-        if mask is None:
-            shape = keypoints0.shape[:2]
-            return FilterOutput(result.inlier.reshape(shape), result.relation.reshape(shape))
-        inlier = torch.zeros_like(mask).masked_scatter(mask, result.inlier)
-        relation = torch.zeros_like(mask, dtype=torch.int8).masked_scatter(mask, result.relation)
-        return FilterOutput(inlier, relation)
+    def to_matches(self) -> Matches:
+        """The inliers, for the next filter. All pairs stay, some possibly empty; gradients flow to the keypoints."""
+        return select_matches(self.matches, self.inlier if self.mask is None else self.inlier[self.mask])

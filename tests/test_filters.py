@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tensor_stereo.batching import collate_matches, select_matches, split_matches, to_padded
-from tensor_stereo.filters import DelaunayFilter, classify_matches
+from tensor_stereo.filters import classify_matches
 from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.types import Classification, Matches, Relation
 from tests.oracles import neighbor_sets, relation_of_sets
 

@@ -1,0 +1,83 @@
+"""The soft score: its time beside the hard verdict, and how well it ranks matches on the paper's scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from bench_pipeline import EIGHT, GATES
+from harness import Suite, matched_points
+
+import tensor_stereo as ts
+from tensor_stereo.batching import from_padded
+from tensor_stereo.configs import MatchingConfig, PipelineConfig
+from tensor_stereo.datasets import PairDataset, find_pairs
+from tensor_stereo.metrics import matches_against_gt, roc_auc, specificity_at_sensitivity
+from tensor_stereo.pipeline import Stopwatch, match_pairs, to_gray_pairs
+
+TEMPERATURES = (1.0,)  # the default; none is chosen on these scenes
+
+
+def hard_jaccard(matches: ts.Matches) -> torch.Tensor:
+    """Shared neighbours over all neighbours, 0 for untested matches."""
+    verdict = ts.classify_matches(matches)
+    union = verdict.degree0 + verdict.degree1 - verdict.overlap
+    return torch.where(verdict.relation == 0, 0, verdict.overlap / union.clamp(min=1))
+
+
+def times(suite: Suite) -> None:
+    for num_pairs, num_rows in ((32, 512), (8, 2048), (2, 8192)):
+        views = zip(*(matched_points("float", num_rows, seed) for seed in range(num_pairs)), strict=True)
+        left, right = (torch.from_numpy(np.stack(view)) for view in views)
+        rows0, ptr = from_padded(left)
+        matches = ts.Matches(rows0, from_padded(right)[0], ptr)
+        module = ts.DelaunayFilter()
+        leaf = right.clone().requires_grad_()
+
+        def backward(module=module, left=left, leaf=leaf) -> None:
+            leaf.grad = None
+            module(left, leaf).score.sum().backward()
+
+        cases = {
+            "classify_matches": lambda matches=matches: ts.classify_matches(matches),
+            "DelaunayFilter forward": lambda module=module, left=left, right=right: module(left, right),
+            "DelaunayFilter forward + backward": backward,
+        }
+        title = f"soft score, ({num_pairs}, {num_rows}, 2), 30 % wrong"
+        suite.compare(title, cases, threads=2, units=num_pairs * num_rows)
+
+
+def accuracy(suite: Suite) -> None:
+    files = find_pairs(suite.options.data / "middlebury", scenes=EIGHT)
+    pairs = [PairDataset(files)[k] for k in range(len(files))]
+    gray = to_gray_pairs([(pair.image0, pair.image1) for pair in pairs])
+    for detector in ("sift", "fast", "gftt"):
+        for gated, matching in ((False, MatchingConfig()), (True, GATES)):
+            matches = match_pairs(gray, PipelineConfig(detector=detector, matching=matching), Stopwatch())
+            correct, valid = matches_against_gt(matches, [pair.disparity_gt for pair in pairs], max_error_px=1.0)
+            scores = {"hard": hard_jaccard(matches)}
+            for temperature in TEMPERATURES:
+                scores[f"soft {temperature:g}"] = ts.DelaunayFilter(temperature=temperature)(matches).score
+            for name, score in scores.items():
+                figures = []
+                for start, stop in zip(matches.ptr[:-1].tolist(), matches.ptr[1:].tolist(), strict=True):
+                    part = slice(start, stop)
+                    known = valid[part]
+                    arguments = score[part].double(), correct[part]
+                    figures.append(
+                        (roc_auc(*arguments, valid=known), specificity_at_sensitivity(*arguments, 0.96, valid=known))
+                    )
+                auc, specificity = np.mean(figures, 0)
+                title = f"{detector}{', gated' if gated else ''}, {name}"
+                suite.note(title, auc=float(auc), specificity_at_96=float(specificity))
+
+
+def main() -> None:
+    suite = Suite("soft")
+    times(suite)
+    if suite.options.data is not None:
+        accuracy(suite)
+    suite.write()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""The classifier as a module: padded keypoints or ragged matches in, verdicts and scores out."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from tensor_stereo.batching import from_padded
+from tensor_stereo.configs import Backend, Restriction, TemperatureUnit
+from tensor_stereo.filters import FilterOutput, classify_graphs
+from tensor_stereo.soft import (
+    SoftGraphs,
+    build_soft_graphs,
+    soft_adjacency,
+    soft_counts,
+    soft_jaccard,
+)
+from tensor_stereo.types import Classification, Matches, Relation
+
+RESTRICTIONS: tuple[Restriction, ...] = ("adjacency", "cardinality")
+
+
+class DelaunayFilter(nn.Module):
+    """:func:`tensor_stereo.classify_matches` with a score, for training loops.
+
+    Args:
+        restriction: of the verdict, as in :func:`tensor_stereo.classify_matches`.
+        score: ``topology``, how far the neighbours of a match agree: the soft Jaccard index of both neighbour sets,
+            which is 1 iff Restriction 1 holds.
+        temperature: below which dual Voronoi edges are hardly told from ties.
+        unit: ``edge``: in lengths of the edge at hand, so that the score does not depend on scale; ``px``: in pixels.
+        learnable_temperature: whether the temperature is a parameter (its logarithm is what is learnt).
+        threshold: verdict by score >= threshold instead of by ``restriction``.
+        straight_through: the score is the verdict, with the gradient of the soft score.
+        min_group_size: as in :func:`tensor_stereo.classify_matches`.
+        tie_tolerance: as in :func:`tensor_stereo.classify_matches`.
+        backend: as in :func:`tensor_stereo.classify_matches`.
+
+    Raises:
+        ValueError: for an unknown option or a temperature that is not positive.
+
+    Source: the verdict is Bustos, Vargas & Trujillo, CIARP 2016, section 3; the score is this library's.
+
+    Example:
+        >>> left = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(0)) * 100
+        >>> right = left - torch.tensor([5.0, 0.0])
+        >>> output = DelaunayFilter()(left, right)
+        >>> output.inlier.all(), output.score.min() > 0.999
+        (tensor(True), tensor(True))
+    """
+
+    log_temperature: Tensor
+
+    def __init__(
+        self,
+        *,
+        restriction: Restriction = "cardinality",
+        score: str = "topology",
+        temperature: float = 1.0,
+        unit: TemperatureUnit = "edge",
+        learnable_temperature: bool = False,
+        threshold: float | None = None,
+        straight_through: bool = False,
+        min_group_size: int = 4,
+        tie_tolerance: float = 1e-3,
+        backend: Backend = "auto",
+    ) -> None:
+        super().__init__()
+        if restriction not in RESTRICTIONS:
+            raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
+        if score != "topology":
+            raise ValueError(f"score must be 'topology', got {score!r}")
+        if unit not in ("edge", "px"):
+            raise ValueError(f"unit must be 'edge' or 'px', got {unit!r}")
+        if not 0 < temperature < float("inf"):
+            raise ValueError(f"temperature must be positive and finite, got {temperature}")
+        if min_group_size < 1:
+            raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
+        self.restriction = restriction
+        self.score = score
+        self.unit = unit
+        self.threshold = threshold
+        self.straight_through = straight_through
+        self.min_group_size = min_group_size
+        self.tie_tolerance = tie_tolerance
+        self.backend = backend
+        logarithm = torch.tensor(temperature, dtype=torch.float64).log()
+        if learnable_temperature:
+            self.log_temperature = nn.Parameter(logarithm)
+        else:
+            self.register_buffer("log_temperature", logarithm)
+
+    @property
+    def temperature(self) -> Tensor:
+        """() float64, in ``unit``."""
+        return self.log_temperature.exp()
+
+    def forward(
+        self,
+        keypoints0: Tensor | Matches,
+        keypoints1: Tensor | None = None,
+        mask: Tensor | None = None,
+        group: Tensor | None = None,
+        cost: Tensor | None = None,
+    ) -> FilterOutput:
+        """Classify and score padded pairs, or a ragged batch given as the only argument.
+
+        Args:
+            keypoints0: (B, N, 2) float32 or float64 px of view 0, or :class:`Matches`. Pairs need not be rectified.
+            keypoints1: (B, N, 2) px of view 1; row i of both is one match.
+            mask: (B, N) bool, True for real matches; None means all. The padding may hold anything.
+            group: (B, N) integer object groups.
+            cost: (B, N), lower is better; decides between duplicates.
+
+        Returns:
+            ``inlier``, ``score`` and ``relation`` in the layout of the input. The score has the dtype of the keypoints,
+            under autocast that of autocast. Gradients flow from it to both keypoints and the temperature, and are zero
+            for untested matches.
+
+        Raises:
+            ValueError: if shapes disagree, or as :func:`tensor_stereo.classify_matches`.
+            TypeError: for keypoints in half precision, which cannot tell pixels apart beyond 256.
+        """
+        if isinstance(keypoints0, Matches):
+            return FilterOutput(*self._classify(keypoints0), keypoints0)
+        mask = _check_padded(keypoints0, keypoints1, mask, group, cost)
+        rows0, ptr = from_padded(keypoints0, mask)
+        rows1, cost, group = (None if v is None else from_padded(v, mask)[0] for v in (keypoints1, cost, group))
+        matches = Matches(rows0, rows1, ptr, cost, group)  # type: ignore[arg-type]
+        inlier, score, relation = (_spread(rows, mask) for rows in self._classify(matches))
+        return FilterOutput(inlier, score, relation, matches, mask)
+
+    def _classify(self, matches: Matches) -> tuple[Tensor, Tensor, Tensor]:
+        """inlier, score and relation of every match."""
+        found = build_soft_graphs(
+            matches, self.temperature, unit=self.unit, tie_tolerance=self.tie_tolerance, backend=self.backend
+        )
+        verdict = classify_graphs(
+            found.graphs, restriction=self.restriction, min_group_size=self.min_group_size, backend=self.backend
+        )
+        score = self._score(matches, found, verdict)
+        is_tested = verdict.relation != Relation.UNTESTED
+        inlier = verdict.inlier if self.threshold is None else is_tested & (score.detach() >= self.threshold)
+        if self.straight_through:
+            score = score + (inlier.to(score.dtype) - score).detach()
+        device = matches.keypoints0.device.type
+        low = torch.is_autocast_enabled(device)
+        dtype = torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype
+        return inlier, score.to(dtype), verdict.relation
+
+    def _score(self, matches: Matches, found: SoftGraphs, verdict: Classification) -> Tensor:
+        """(M,) float64."""
+        adjacency0, adjacency1 = (
+            soft_adjacency(
+                keypoints,
+                found.pairs,
+                geometry,
+                self.temperature,
+                unit=self.unit,
+                pair_ptr=found.pair_ptr,
+                tie_tolerance=self.tie_tolerance,
+                backend=self.backend,
+            )
+            for keypoints, geometry in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1))
+        )
+        score = soft_jaccard(soft_counts(adjacency0, adjacency1, found.pairs, matches.num_matches))
+        return torch.where(verdict.relation == Relation.UNTESTED, torch.zeros_like(score), score)
+
+
+def _check_padded(
+    keypoints0: Tensor, keypoints1: Tensor | None, mask: Tensor | None, group: Tensor | None, cost: Tensor | None
+) -> Tensor:
+    """The mask; raises unless all shapes fit."""
+    if keypoints1 is None:
+        raise ValueError("keypoints1 must be given with keypoints0")
+    if keypoints0.ndim != 3 or keypoints0.shape[2] != 2:
+        raise ValueError(f"keypoints0 must have shape (B, N, 2), got {tuple(keypoints0.shape)}")
+    for name, value, shape in (
+        ("keypoints1", keypoints1, keypoints0.shape),
+        ("mask", mask, keypoints0.shape[:2]),
+        ("group", group, keypoints0.shape[:2]),
+        ("cost", cost, keypoints0.shape[:2]),
+    ):
+        if value is not None and value.shape != shape:
+            raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(value.shape)}")
+    return torch.ones(keypoints0.shape[:2], dtype=torch.bool, device=keypoints0.device) if mask is None else mask
+
+
+def _spread(rows: Tensor, mask: Tensor) -> Tensor:
+    """(M,) rows -> (B, N), zero in the padding."""
+    return torch.zeros_like(mask, dtype=rows.dtype).masked_scatter(mask, rows)

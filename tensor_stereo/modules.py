@@ -17,6 +17,7 @@ from tensor_stereo.soft import (
 )
 from tensor_stereo.types import Classification, Matches, Relation
 
+UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
 RESTRICTIONS: tuple[Restriction, ...] = ("adjacency", "cardinality")
 
 
@@ -139,7 +140,7 @@ class DelaunayFilter(nn.Module):
             found.graphs, restriction=self.restriction, min_group_size=self.min_group_size, backend=self.backend
         )
         score = self._score(matches, found, verdict)
-        is_tested = verdict.relation != Relation.UNTESTED
+        is_tested = verdict.relation != UNTESTED
         inlier = verdict.inlier if self.threshold is None else is_tested & (score.detach() >= self.threshold)
         if self.straight_through:
             score = score + (inlier.to(score.dtype) - score).detach()
@@ -164,7 +165,7 @@ class DelaunayFilter(nn.Module):
             for keypoints, geometry in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1))
         )
         score = soft_jaccard(soft_counts(adjacency0, adjacency1, found.pairs, matches.num_matches))
-        return torch.where(verdict.relation == Relation.UNTESTED, torch.zeros_like(score), score)
+        return torch.where(verdict.relation == UNTESTED, torch.zeros_like(score), score)
 
 
 def _check_padded(

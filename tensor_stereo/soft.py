@@ -163,7 +163,7 @@ def dual_edge_length(
     Example:
         >>> points = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [1.0, -2.0]])
         >>> dual_edge_length(points, torch.tensor([[0, 1]]), torch.tensor([[3, 2]]))
-        tensor([-0.7500], dtype=torch.float64)
+        tensor([0.7500], dtype=torch.float64)
     """
     points = _to_float64("keypoints", keypoints)
     ratio = _ratio(points, pairs, critical, pair_ptr, tie_tolerance, backend)

@@ -1,0 +1,240 @@
+"""The soft score against its definition, its limits and its gradient."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+import tensor_stereo as ts
+from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.relations import shared_neighbors
+from tensor_stereo.soft import (
+    PairGeometry,
+    SoftCounts,
+    build_soft_graphs,
+    dual_critical_points,
+    dual_edge_length,
+    soft_adjacency,
+    soft_counts,
+    soft_jaccard,
+    soft_overlap,
+)
+from tests.oracles import installed_backends
+from tests.point_sets import GENERATORS, distinct_points
+
+KINDS = sorted(GENERATORS)
+BACKENDS = installed_backends()
+
+
+def _matches(kind: str, seed: int, n: int, wrong: float = 0.4) -> ts.Matches:
+    """Two views that differ in some points."""
+    left = distinct_points(kind, seed, n)
+    right = left.copy()
+    rng = np.random.default_rng(seed)
+    moved = np.flatnonzero(rng.random(len(left)) < wrong)
+    right[moved] = right[rng.permutation(moved)]
+    return ts.Matches(torch.from_numpy(left), torch.from_numpy(right), torch.tensor([0, len(left)]))
+
+
+def _counts(matches: ts.Matches, temperature: float, unit: str = "edge", backend: str = "auto") -> SoftCounts:
+    found = build_soft_graphs(matches, temperature, unit=unit, backend=backend)
+    adjacencies = [
+        soft_adjacency(points, found.pairs, view, temperature, unit=unit, backend=backend)
+        for points, view in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1))
+    ]
+    return soft_counts(*adjacencies, found.pairs, matches.num_matches)
+
+
+def _length_by_definition(points: np.ndarray, i: int, j: int, bound: float) -> float:
+    """hi - lo of the bounds of t over all third points, in px; design of the power functions, point by point."""
+    a, b = points[i], points[j]
+    length = math.dist(a, b)
+    middle, normal = (a + b) / 2, np.array([a[1] - b[1], b[0] - a[0]]) / length
+    low, high = -bound * length, bound * length
+    for k in range(len(points)):
+        if k in (i, j):
+            continue
+        slope = 2 * normal @ (middle - points[k])
+        offset = (middle - points[k]) @ (middle - points[k]) - (middle - a) @ (middle - a)
+        if slope > 0:
+            low = max(low, -offset / slope)
+        else:
+            high = min(high, -offset / slope)
+    return float(high - low)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@given(st.integers(0, 10**6), st.integers(3, 25), st.sampled_from(["edge", "px"]), st.sampled_from([0.3, 1.0, 4.0]))
+def test_counts_are_those_of_the_definition(backend: str, seed: int, n: int, unit: str, temperature: float) -> None:
+    matches = _matches("uniform", seed, n)
+    found = build_soft_graphs(matches, temperature, unit=unit, backend=backend)
+    expected = np.zeros((n, 3))
+    for i, j in found.pairs.tolist():
+        soft = []
+        for points in (matches.keypoints0.numpy(), matches.keypoints1.numpy()):
+            scale = temperature * (math.dist(points[i], points[j]) if unit == "edge" else 1)
+            soft.append(1 / (1 + math.exp(-min(max(_length_by_definition(points, i, j, 1e3) / scale, -40), 40))))
+        for row in (i, j):
+            expected[row] += (min(soft), *soft)
+    counts = _counts(matches, temperature, unit, backend)
+    assert torch.stack([counts.intersection, counts.degree0, counts.degree1], 1).numpy() == pytest.approx(
+        expected, abs=2e-6 * n
+    )  # pairs beyond the reach of 16 temperatures count as 40: 1.2e-7 each
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@given(st.sampled_from(KINDS), st.integers(0, 10**6), st.integers(2, 30))
+def test_limit_of_temperature_zero_is_the_hard_graph(backend: str, kind: str, seed: int, n: int) -> None:
+    matches = _matches(kind, seed, n)
+    found = build_soft_graphs(matches, backend=backend)
+    for points, view in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1)):
+        length = dual_edge_length(points, found.pairs, view.critical, backend=backend)
+        edge = (points[found.pairs[:, 0]] - points[found.pairs[:, 1]]).norm(dim=1)
+        assume(bool((length.abs() > 1e-6 * edge).all()))
+    counts = _counts(matches, 1e-8, backend=backend)
+    graphs = build_match_graphs(matches, backend=backend)
+    hard = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=backend)
+    assert counts.intersection.numpy() == pytest.approx(hard.overlap.numpy(), abs=1e-12)
+    assert counts.degree0.numpy() == pytest.approx(hard.degree0.numpy(), abs=1e-12)
+    assert counts.degree1.numpy() == pytest.approx(hard.degree1.numpy(), abs=1e-12)
+
+
+@given(st.sampled_from(KINDS), st.integers(0, 10**6), st.integers(2, 30))
+def test_limits_of_the_scores_are_the_restrictions(kind: str, seed: int, n: int) -> None:
+    matches = _matches(kind, seed, n)
+    counts = _counts(matches, 1e-8)
+    for restriction, score in (("adjacency", soft_jaccard(counts)), ("cardinality", soft_overlap(counts))):
+        verdict = ts.classify_matches(matches, restriction=restriction, min_group_size=1)
+        tested = verdict.relation != ts.Relation.UNTESTED
+        sure = (score < 0.4) | (score > 1 - 1e-9)  # in between lie ties, which count half
+        assert torch.equal((score > 1 - 1e-9)[tested & sure], verdict.inlier[tested & sure])
+
+
+@given(st.sampled_from(KINDS), st.integers(0, 10**6), st.integers(1, 30))
+def test_equal_views_agree_fully_at_any_temperature(kind: str, seed: int, n: int) -> None:
+    matches = _matches(kind, seed, n, wrong=0)
+    score = soft_jaccard(_counts(matches, 1.0))
+    assert torch.equal(score, torch.full((matches.num_matches,), float(matches.num_matches > 1), dtype=torch.float64))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("unit", ["edge", "px"])
+@pytest.mark.parametrize("n", [4, 9, 25])
+def test_gradient_equals_finite_differences_in_general_position(backend: str, unit: str, n: int) -> None:
+    generator = torch.Generator().manual_seed(n)
+    left, right = (torch.rand(n, 2, dtype=torch.float64, generator=generator) * 10 for _ in range(2))
+    ptr = torch.tensor([0, n])
+    found = build_soft_graphs(ts.Matches(left, right, ptr), unit=unit, backend=backend)
+    assert bool((found.view0.critical == -1).any())  # hull edges are among them
+
+    def score(k0: torch.Tensor, k1: torch.Tensor, temperature: torch.Tensor) -> torch.Tensor:
+        adjacencies = [
+            soft_adjacency(points, found.pairs, view, temperature, unit=unit, pair_ptr=found.pair_ptr, backend=backend)
+            for points, view in ((k0, found.view0), (k1, found.view1))
+        ]
+        counts = soft_counts(*adjacencies, found.pairs, n)
+        return torch.cat([soft_jaccard(counts), soft_overlap(counts)])
+
+    temperature = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(score, (left.requires_grad_(), right.requires_grad_(), temperature))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_length_has_a_gradient_to_all_four_points_without_hull_edges(backend: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(40, 2, dtype=torch.float64, generator=generator)
+    ptr = torch.tensor([0, 40])
+    pairs = build_soft_graphs(ts.Matches(points, points, ptr)).pairs
+    critical = dual_critical_points(points, ptr, pairs, backend=backend)
+    inner = (critical >= 0).all(1)
+    pairs, critical = pairs[inner], critical[inner]
+    assert torch.autograd.gradcheck(
+        lambda p: dual_edge_length(p, pairs, critical, backend=backend), points.requires_grad_()
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@given(
+    st.sampled_from(KINDS),
+    st.integers(0, 10**6),
+    st.integers(1, 30),
+    st.sampled_from(["edge", "px"]),
+    st.sampled_from([1e-6, 1e-2, 1.0, 1e3]),
+    st.sampled_from([0.0, 1e-3]),
+)
+def test_gradients_are_finite_everywhere(
+    backend: str, kind: str, seed: int, n: int, unit: str, temperature: float, tie_tolerance: float
+) -> None:
+    matches = _matches(kind, seed, n)
+    leaves = [points.clone().requires_grad_() for points in (matches.keypoints0, matches.keypoints1)]
+    module = ts.DelaunayFilter(
+        temperature=temperature,
+        unit=unit,
+        learnable_temperature=True,
+        min_group_size=1,
+        tie_tolerance=tie_tolerance,
+        backend=backend,
+    )
+    output = module(ts.Matches(*leaves, matches.ptr))
+    assert bool(((output.score >= 0) & (output.score <= 1)).all())
+    output.score.sum().backward()
+    for leaf in (*leaves, module.log_temperature):
+        assert leaf.grad is not None
+        assert bool(leaf.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_back_ends_give_the_same_gradient(backend: str) -> None:
+    matches = _matches("grid_8px", 3, 60)
+    gradients = []
+    for choice in (backend, "scipy"):
+        leaf = matches.keypoints1.clone().requires_grad_()
+        ts.DelaunayFilter(backend=choice)(
+            ts.Matches(matches.keypoints0, leaf, matches.ptr)
+        ).score.square().sum().backward()
+        gradients.append(leaf.grad)
+    assert torch.allclose(*gradients, rtol=1e-12, atol=1e-12)
+
+
+def test_the_two_diagonals_of_a_flip_change_places_without_a_jump() -> None:
+    left = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [2.0, 9.0], [-5.0, 1.0]], dtype=torch.float64)
+    diagonals, edges = [], []
+    for shift in (-0.2, -1e-9, 0.0, 1e-9, 0.2):
+        moved = left.clone()
+        moved[2, 0] += shift
+        found = build_soft_graphs(ts.Matches(moved, left.flip(0), torch.tensor([0, 6])), tie_tolerance=0)
+        adjacency = soft_adjacency(moved, found.pairs, found.view0, tie_tolerance=0)
+        place = {tuple(pair): k for k, pair in enumerate(found.pairs.tolist())}
+        diagonals.append(adjacency[[place[0, 2], place[1, 3]]])
+        edges.append(found.pairs[found.view0.is_edge].tolist())
+    assert [[0, 2] in e for e in edges] != [[1, 3] in e for e in edges]  # they do change places
+    for near in diagonals[1:4]:
+        assert torch.allclose(near, torch.full_like(near, 0.5), atol=1e-8)
+    assert float((diagonals[0] - 0.5).abs().min()) > 1e-3  # they do move
+
+
+def test_no_neighbour_scores_zero() -> None:
+    zero, one = torch.zeros(1), torch.ones(1)
+    assert soft_jaccard(SoftCounts(zero, zero, zero, zero)).item() == 0
+    assert soft_overlap(SoftCounts(zero, one, zero, one)).item() == 0
+
+
+def test_half_precision_keypoints_are_refused() -> None:
+    points = torch.rand(3, 2)
+    tie = PairGeometry(torch.tensor([[-1, 2]]), torch.tensor([True]))
+    for dtype in (torch.float16, torch.bfloat16):
+        with pytest.raises(TypeError, match="keypoints"):
+            soft_adjacency(points.to(dtype), torch.tensor([[0, 1]]), tie)
+        with pytest.raises(TypeError, match="keypoints0"):
+            ts.DelaunayFilter()(points[None].to(dtype), points[None].to(dtype))
+
+
+def test_unknown_unit_is_refused() -> None:
+    matches = _matches("uniform", 0, 5)
+    with pytest.raises(ValueError, match="unit"):
+        build_soft_graphs(matches, unit="cm")  # type: ignore[arg-type]

@@ -18,6 +18,7 @@
 #include "tensor_stereo/one_to_one.hpp"
 #include "tensor_stereo/predicates.hpp"
 #include "tensor_stereo/row_overlap.hpp"
+#include "tensor_stereo/soft_counts.hpp"
 #include "tensor_stereo/soft_match_graphs.hpp"
 
 namespace nb = nanobind;
@@ -29,6 +30,8 @@ template <class T, class... Shape>
 using Input = nb::ndarray<const T, Shape..., nb::c_contig, nb::device::cpu>;
 using Points = Input<double, nb::shape<-1, 2>>;
 using Pairs = Input<std::int64_t, nb::shape<-1, 2>>;
+using Triples = Input<double, nb::shape<-1, 3>>;
+using Flags = Input<bool, nb::ndim<1>>;
 using Matrix = Input<float, nb::ndim<2>>;
 using Integers = Input<std::int64_t, nb::ndim<1>>;
 using Doubles = Input<double, nb::ndim<1>>;
@@ -52,11 +55,11 @@ void check_offsets(const Integers& ptr, std::int64_t total, const char* message)
     for (std::size_t k = 1; k < size; ++k) check(ptr.data()[k - 1] <= ptr.data()[k], message);
 }
 
-template <class T>
+template <std::size_t kColumns, class T>
 auto give_rows(ts::Buffer<T> values, std::size_t rows) {
     T* const data = values.release();
     nb::capsule owner(data, [](void* memory) noexcept { ts::Free()(memory); });
-    return nb::ndarray<nb::numpy, T, nb::shape<-1, 2>>(data, {rows, 2}, owner);
+    return nb::ndarray<nb::numpy, T, nb::shape<-1, kColumns>>(data, {rows, kColumns}, owner);
 }
 
 auto give_pattern(ts::SparsePattern graph) {
@@ -98,9 +101,9 @@ auto soft_match_graphs(Points points0, Points points1, Integers index, Integers 
     }
     const auto num_pairs = static_cast<std::size_t>(found.num_pairs);
     return std::tuple(give_pattern(std::move(found.graph[0])), give_pattern(std::move(found.graph[1])),
-                      give_rows(std::move(found.pairs), num_pairs), give(std::move(found.pair_ptr), ptr.shape(0)),
-                      give_rows(std::move(found.view[0].critical), num_pairs),
-                      give_rows(std::move(found.view[1].critical), num_pairs),
+                      give_rows<2>(std::move(found.pairs), num_pairs), give(std::move(found.pair_ptr), ptr.shape(0)),
+                      give_rows<2>(std::move(found.view[0].critical), num_pairs),
+                      give_rows<2>(std::move(found.view[1].critical), num_pairs),
                       give(std::move(found.view[0].is_edge), num_pairs),
                       give(std::move(found.view[1].is_edge), num_pairs));
 }
@@ -118,42 +121,104 @@ auto dual_critical_points(Points points, Integers index, Integers ptr, Pairs pai
                                          static_cast<std::int64_t>(ptr.shape(0)) - 1, pairs.data(), pair_ptr.data(),
                                          num_threads);
     }
-    return give_rows(std::move(found.critical), num_pairs);
+    return give_rows<2>(std::move(found.critical), num_pairs);
 }
 
-ts::DualEdges dual_edges(const Points& points, const Pairs& pairs, const Pairs& critical, const Integers& ptr,
-                         double bound) {
+void check_rows(const Pairs& rows, std::int64_t lowest, std::int64_t num_points, const char* message) {
+    for (std::size_t k = 0; k < 2 * rows.shape(0); ++k) {
+        check(rows.data()[k] >= lowest && rows.data()[k] < num_points, message);
+    }
+}
+
+ts::DualEdges dual_edges(const Points& points, const Pairs& pairs, const Pairs& critical, double bound) {
     const auto num_points = static_cast<std::int64_t>(points.shape(0));
     check(critical.shape(0) == pairs.shape(0), "critical must have one row per pair");
+    check_rows(pairs, 0, num_points, "pairs must name rows of points");
+    check_rows(critical, ts::kBlocked, num_points, "critical must name rows of points, -1 or -2");
+    return {points.data(), pairs.data(), critical.data(), bound};
+}
+
+ts::PairRanges pair_ranges(const Integers& ptr, const Pairs& pairs) {
     check_offsets(ptr, static_cast<std::int64_t>(pairs.shape(0)), "ptr must rise from 0 to the length of pairs");
-    for (std::size_t k = 0; k < 2 * pairs.shape(0); ++k) {
-        check(pairs.data()[k] >= 0 && pairs.data()[k] < num_points, "pairs must name rows of points");
-        check(critical.data()[k] >= -2 && critical.data()[k] < num_points, "critical must name rows of points, -1 or -2");
-    }
-    return {points.data(), pairs.data(), critical.data(), ptr.data(), static_cast<std::int64_t>(ptr.shape(0)) - 1, bound};
+    return {ptr.data(), static_cast<std::int64_t>(ptr.shape(0)) - 1};
+}
+
+ts::Buffer<double> zeros(std::size_t size) {
+    auto values = ts::allocate<double>(size);
+    std::fill_n(values.get(), size, 0.0);
+    return values;
 }
 
 auto dual_edge_ratio(Points points, Pairs pairs, Pairs critical, Integers ptr, double bound, int num_threads) {
-    const ts::DualEdges edges = dual_edges(points, pairs, critical, ptr, bound);
+    const ts::DualEdges edges = dual_edges(points, pairs, critical, bound);
+    const ts::PairRanges ranges = pair_ranges(ptr, pairs);
     auto ratio = ts::allocate<double>(pairs.shape(0));
     {
         const nb::gil_scoped_release release;
-        ts::dual_edge_ratio(edges, num_threads, ratio.get());
+        ranges.each(num_threads, [&](std::int64_t, std::int64_t pair) { ratio[pair] = edges.ratio(pair); });
     }
     return give(std::move(ratio), pairs.shape(0));
 }
 
 auto dual_edge_ratio_backward(Points points, Pairs pairs, Pairs critical, Integers ptr, Doubles ratio_gradient,
                               double bound, int num_threads) {
-    const ts::DualEdges edges = dual_edges(points, pairs, critical, ptr, bound);
+    const ts::DualEdges edges = dual_edges(points, pairs, critical, bound);
+    const ts::PairRanges ranges = pair_ranges(ptr, pairs);
     check(ratio_gradient.shape(0) == pairs.shape(0), "ratio_gradient must have one entry per pair");
-    auto gradient = ts::allocate<double>(2 * points.shape(0));
+    auto gradient = zeros(2 * points.shape(0));
     {
         const nb::gil_scoped_release release;
-        std::fill_n(gradient.get(), 2 * points.shape(0), 0.0);
-        ts::dual_edge_ratio_backward(edges, ratio_gradient.data(), num_threads, gradient.get());
+        ranges.each(num_threads, [&](std::int64_t, std::int64_t pair) {
+            if (ratio_gradient.data()[pair] == 0) return;
+            edges.add_ratio_gradient(pair, ratio_gradient.data()[pair], gradient.get());
+        });
     }
-    return give_rows(std::move(gradient), points.shape(0));
+    return give_rows<2>(std::move(gradient), points.shape(0));
+}
+
+ts::SoftViews soft_views(const Points& points0, const Points& points1, const Pairs& pairs, const Pairs& critical0,
+                         const Pairs& critical1, const Flags& is_edge0, const Flags& is_edge1, const Integers& ptr,
+                         double temperature, double saturation, bool in_px, double bound) {
+    check(points0.shape(0) == points1.shape(0), "points0 and points1 must have the same length");
+    check(is_edge0.shape(0) == pairs.shape(0) && is_edge1.shape(0) == pairs.shape(0), "is_edge must have one entry per pair");
+    return {{dual_edges(points0, pairs, critical0, bound), dual_edges(points1, pairs, critical1, bound)},
+            {is_edge0.data(), is_edge1.data()},
+            pair_ranges(ptr, pairs),
+            temperature,
+            saturation,
+            in_px};
+}
+
+auto soft_counts(Points points0, Points points1, Pairs pairs, Pairs critical0, Pairs critical1, Flags is_edge0,
+                 Flags is_edge1, Integers ptr, double temperature, double saturation, bool in_px, double bound,
+                 int num_threads) {
+    const ts::SoftViews views = soft_views(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, ptr,
+                                           temperature, saturation, in_px, bound);
+    auto counts = zeros(3 * points0.shape(0));
+    {
+        const nb::gil_scoped_release release;
+        ts::soft_counts(views, num_threads, counts.get());
+    }
+    return give_rows<3>(std::move(counts), points0.shape(0));
+}
+
+auto soft_counts_backward(Points points0, Points points1, Pairs pairs, Pairs critical0, Pairs critical1, Flags is_edge0,
+                          Flags is_edge1, Integers ptr, Triples counts_gradient, double temperature, double saturation,
+                          bool in_px, double bound, int num_threads) {
+    const ts::SoftViews views = soft_views(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, ptr,
+                                           temperature, saturation, in_px, bound);
+    check(counts_gradient.shape(0) == points0.shape(0), "counts_gradient must have one row per point");
+    auto gradient0 = zeros(2 * points0.shape(0)), gradient1 = zeros(2 * points0.shape(0));
+    auto partial = zeros(views.ranges.count);
+    {
+        const nb::gil_scoped_release release;
+        ts::soft_counts_backward(views, counts_gradient.data(), num_threads, gradient0.get(), gradient1.get(),
+                                 partial.get());
+    }
+    double of_temperature = 0;
+    for (std::int64_t range = 0; range < views.ranges.count; ++range) of_temperature += partial[range];
+    return std::tuple(give_rows<2>(std::move(gradient0), points0.shape(0)),
+                      give_rows<2>(std::move(gradient1), points0.shape(0)), of_temperature);
 }
 
 auto row_overlap(Integers crow0, Integers cols0, Integers crow1, Integers cols1, int num_threads) {
@@ -264,6 +329,14 @@ NB_MODULE(_kernels, module) {
                nb::arg("ptr"), nb::arg("bound"), nb::arg("num_threads"));
     module.def("dual_edge_ratio_backward", &dual_edge_ratio_backward, nb::arg("points"), nb::arg("pairs"),
                nb::arg("critical"), nb::arg("ptr"), nb::arg("ratio_gradient"), nb::arg("bound"), nb::arg("num_threads"));
+    module.def("soft_counts", &soft_counts, nb::arg("points0"), nb::arg("points1"), nb::arg("pairs"),
+               nb::arg("critical0"), nb::arg("critical1"), nb::arg("is_edge0"), nb::arg("is_edge1"), nb::arg("ptr"),
+               nb::arg("temperature"), nb::arg("saturation"), nb::arg("in_px"), nb::arg("bound"),
+               nb::arg("num_threads"));
+    module.def("soft_counts_backward", &soft_counts_backward, nb::arg("points0"), nb::arg("points1"), nb::arg("pairs"),
+               nb::arg("critical0"), nb::arg("critical1"), nb::arg("is_edge0"), nb::arg("is_edge1"), nb::arg("ptr"),
+               nb::arg("counts_gradient"), nb::arg("temperature"), nb::arg("saturation"), nb::arg("in_px"),
+               nb::arg("bound"), nb::arg("num_threads"));
     module.def("row_overlap", &row_overlap, nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
                nb::arg("num_threads"));
     module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),

@@ -8,13 +8,7 @@ from torch import Tensor, nn
 from tensor_stereo.batching import from_padded
 from tensor_stereo.configs import Backend, Restriction, TemperatureUnit
 from tensor_stereo.filters import FilterOutput, classify_graphs
-from tensor_stereo.soft import (
-    SoftGraphs,
-    build_soft_graphs,
-    soft_adjacency,
-    soft_counts,
-    soft_jaccard,
-)
+from tensor_stereo.soft import SoftGraphs, build_soft_graphs, count_soft_neighbors, soft_jaccard
 from tensor_stereo.types import Classification, Matches, Relation
 
 UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
@@ -151,20 +145,10 @@ class DelaunayFilter(nn.Module):
 
     def _score(self, matches: Matches, found: SoftGraphs, verdict: Classification) -> Tensor:
         """(M,) float64."""
-        adjacency0, adjacency1 = (
-            soft_adjacency(
-                keypoints,
-                found.pairs,
-                geometry,
-                self.temperature,
-                unit=self.unit,
-                pair_ptr=found.pair_ptr,
-                tie_tolerance=self.tie_tolerance,
-                backend=self.backend,
-            )
-            for keypoints, geometry in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1))
+        counts = count_soft_neighbors(
+            matches, found, self.temperature, unit=self.unit, tie_tolerance=self.tie_tolerance, backend=self.backend
         )
-        score = soft_jaccard(soft_counts(adjacency0, adjacency1, found.pairs, matches.num_matches))
+        score = soft_jaccard(counts)
         return torch.where(verdict.relation == UNTESTED, torch.zeros_like(score), score)
 
 

@@ -254,6 +254,70 @@ def soft_counts(adjacency0: Tensor, adjacency1: Tensor, pairs: Tensor, num_match
     return SoftCounts(intersection, degree0 + degree1 - intersection, degree0, degree1)
 
 
+def count_soft_neighbors(
+    matches: Matches,
+    found: SoftGraphs,
+    temperature: Tensor | float = 1.0,
+    *,
+    unit: TemperatureUnit = "edge",
+    tie_tolerance: float = 1e-3,
+    backend: Backend = "auto",
+) -> SoftCounts:
+    """:func:`soft_adjacency` in both views and :func:`soft_counts`, where there are native kernels in one pass.
+
+    Args:
+        matches: as in :func:`build_soft_graphs`.
+        found: what it has found.
+        temperature: (); positive.
+        unit: as in :func:`build_soft_graphs`.
+        tie_tolerance: as in :func:`build_soft_graphs`.
+        backend: as in :func:`tensor_stereo.build_graphs`.
+
+    Returns:
+        Gradients flow to both keypoints and the temperature, and are finite. Not differentiable twice.
+
+    Example:
+        >>> corners = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
+        >>> matches = Matches(corners, corners, torch.tensor([0, 4]))
+        >>> count_soft_neighbors(matches, build_soft_graphs(matches)).intersection > 2  # and half of a diagonal
+        tensor([True, True, True, True])
+    """
+    _check_unit(unit)
+    views = (("keypoints0", matches.keypoints0, found.view0), ("keypoints1", matches.keypoints1, found.view1))
+    if ops.resolve_backend(backend) == "scipy":
+        adjacency0, adjacency1 = (
+            soft_adjacency(
+                keypoints,
+                found.pairs,
+                view,
+                temperature,
+                unit=unit,
+                pair_ptr=found.pair_ptr,
+                tie_tolerance=tie_tolerance,
+                backend=backend,
+            )
+            for _, keypoints, view in views
+        )
+        return soft_counts(adjacency0, adjacency1, found.pairs, matches.num_matches)
+    points0, points1 = (_to_float64(name, keypoints) for name, keypoints, _ in views)
+    counts = ops.soft_counts(
+        points0,
+        points1,
+        found.pairs,
+        found.view0.critical,
+        found.view1.critical,
+        found.view0.is_edge,
+        found.view1.is_edge,
+        found.pair_ptr,
+        torch.as_tensor(temperature, dtype=torch.float64, device=points0.device),
+        SATURATION,
+        unit == "px",
+        _bound(tie_tolerance),
+    )
+    intersection, degree0, degree1 = counts.unbind(1)
+    return SoftCounts(intersection, degree0 + degree1 - intersection, degree0, degree1)
+
+
 def soft_jaccard(counts: SoftCounts) -> Tensor:
     """Shared over all neighbours, (M,) in [0, 1]; 1 iff both sides agree, the limit of Restriction 1. No neighbour: 0.
 
@@ -286,9 +350,13 @@ def _ratio(
 ) -> Tensor:
     if pair_ptr is None:
         pair_ptr = torch.tensor([0, len(pairs)], device=pairs.device)
-    bound = 1 / tie_tolerance if tie_tolerance > 0 else _UNBOUNDED
-    ratio: Tensor = ops.dual_edge_ratio(points, pairs, critical, pair_ptr, bound, backend)
+    ratio: Tensor = ops.dual_edge_ratio(points, pairs, critical, pair_ptr, _bound(tie_tolerance), backend)
     return ratio
+
+
+def _bound(tie_tolerance: float) -> float:
+    """Edge lengths to which the ends of dual edges are clipped."""
+    return 1 / tie_tolerance if tie_tolerance > 0 else _UNBOUNDED
 
 
 def _to_float64(name: str, keypoints: Tensor) -> Tensor:

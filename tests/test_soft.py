@@ -17,6 +17,7 @@ from tensor_stereo.soft import (
     PairGeometry,
     SoftCounts,
     build_soft_graphs,
+    count_soft_neighbors,
     dual_critical_points,
     dual_edge_length,
     soft_adjacency,
@@ -142,6 +143,13 @@ def test_gradient_equals_finite_differences_in_general_position(backend: str, un
 
     temperature = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(score, (left.requires_grad_(), right.requires_grad_(), temperature))
+
+    def fused(k0: torch.Tensor, k1: torch.Tensor, temperature: torch.Tensor) -> torch.Tensor:
+        counts = count_soft_neighbors(ts.Matches(k0, k1, ptr), found, temperature, unit=unit, backend=backend)
+        return torch.cat([soft_jaccard(counts), soft_overlap(counts)])
+
+    assert torch.autograd.gradcheck(fused, (left, right, temperature))
+    assert torch.allclose(fused(left, right, temperature), score(left, right, temperature), rtol=1e-12)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

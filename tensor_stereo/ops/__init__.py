@@ -13,4 +13,6 @@ from tensor_stereo.ops.predicates import incircle as incircle
 from tensor_stereo.ops.predicates import orientation as orientation
 from tensor_stereo.ops.relate import relate as relate
 from tensor_stereo.ops.row_overlap import row_overlap as row_overlap
+from tensor_stereo.ops.soft_counts import soft_counts as soft_counts
+from tensor_stereo.ops.soft_counts import soft_counts_backward as soft_counts_backward
 from tensor_stereo.ops.soft_match_graphs import soft_match_graphs as soft_match_graphs

@@ -100,7 +100,7 @@ def test_pairs_hold_both_graphs_and_do_not_depend_on_the_order_of_matches(
 
 @pytest.mark.parametrize("backend", installed_backends())
 def test_operators_keep_the_rules_of_torch(backend: str) -> None:
-    left, right, ptr = _views("random", 0, 20)
+    left, right, ptr = _views("uniform", 0, 20)
     reach = torch.tensor([16.0, 0.0], dtype=torch.float64)
     arguments = (left, right, ptr, None, None, reach, 1e-3, backend)
     torch.library.opcheck(torch.ops.tensor_stereo.soft_match_graphs.default, arguments)
@@ -113,6 +113,25 @@ def test_operators_keep_the_rules_of_torch(backend: str) -> None:
     torch.library.opcheck(
         torch.ops.tensor_stereo.dual_edge_ratio_backward.default,
         (left, pairs, critical, pair_ptr, torch.ones(len(pairs), dtype=torch.float64), 1e3, backend),
+    )
+
+
+@NATIVE
+@pytest.mark.parametrize("in_px", [False, True])
+def test_soft_counts_keep_the_rules_of_torch(in_px: bool) -> None:
+    left, right, ptr = _views("uniform", 0, 20)
+    reach = torch.tensor([16.0, 0.0], dtype=torch.float64)
+    _, _, _, _, _, pairs, pair_ptr, *geometry = ops.soft_match_graphs(
+        left, right, ptr, None, None, reach, 1e-3, "native"
+    )
+    leaves = [left.clone().requires_grad_(), right.clone().requires_grad_()]
+    temperature = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+    arguments = (pairs, *geometry, pair_ptr)
+    settings = (40.0, in_px, 1e3)
+    torch.library.opcheck(torch.ops.tensor_stereo.soft_counts.default, (*leaves, *arguments, temperature, *settings))
+    torch.library.opcheck(
+        torch.ops.tensor_stereo.soft_counts_backward.default,
+        (left, right, *arguments, temperature.detach(), *settings, torch.ones(20, 3, dtype=torch.float64)),
     )
 
 

@@ -1,0 +1,73 @@
+#include "tensor_stereo/soft_counts.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace tensor_stereo {
+namespace {
+
+struct Adjacency {
+    double value;     // of the sigmoid
+    double slope;     // of the value by the dual length in units of the temperature
+    double exponent;  // the argument of the sigmoid
+    double ratio, length;  // dual length in lengths of the pair, length of the pair if in px
+};
+
+inline Adjacency adjacency(const SoftViews& views, int v, std::int64_t pair) noexcept {
+    const DualEdges& edges = views.view[v];
+    Adjacency result{0, 0, 0, edges.ratio(pair), 1};
+    if (views.in_px) {
+        const Point i = edges.first(pair), j = edges.second(pair);
+        result.length = std::sqrt((j.x - i.x) * (j.x - i.x) + (j.y - i.y) * (j.y - i.y));
+    }
+    const double size = std::fabs(result.ratio * result.length) / views.temperature;
+    const double signed_size = views.is_edge[v][pair] ? size : -size;
+    result.exponent = std::min(std::max(signed_size, -views.saturation), views.saturation);
+    result.value = 1 / (1 + std::exp(-result.exponent));
+    result.slope = size <= views.saturation ? result.value * (1 - result.value) : 0;
+    return result;
+}
+
+}  // namespace
+
+void soft_counts(const SoftViews& views, int num_threads, double* counts) {
+    const std::int64_t* const pairs = views.view[0].pairs;
+    views.ranges.each(num_threads, [&](std::int64_t, std::int64_t pair) {
+        const double a = adjacency(views, 0, pair).value, b = adjacency(views, 1, pair).value, shared = std::min(a, b);
+        for (int end = 0; end < 2; ++end) {
+            double* const row = counts + 3 * pairs[2 * pair + end];
+            row[0] += shared;
+            row[1] += a;
+            row[2] += b;
+        }
+    });
+}
+
+void soft_counts_backward(const SoftViews& views, const double* counts_gradient, int num_threads, double* gradient0,
+                          double* gradient1, double* temperature_gradient) {
+    const std::int64_t* const pairs = views.view[0].pairs;
+    double* const gradients[] = {gradient0, gradient1};
+    views.ranges.each(num_threads, [&](std::int64_t range, std::int64_t pair) {
+        const double* const of_i = counts_gradient + 3 * pairs[2 * pair];
+        const double* const of_j = counts_gradient + 3 * pairs[2 * pair + 1];
+        const Adjacency both[] = {adjacency(views, 0, pair), adjacency(views, 1, pair)};
+        for (int v = 0; v < 2; ++v) {
+            const Adjacency& own = both[v];
+            if (own.slope == 0) continue;
+            const double other = both[1 - v].value, share = own.value < other ? 1 : own.value > other ? 0 : 0.5;
+            const double of_value = share * (of_i[0] + of_j[0]) + of_i[1 + v] + of_j[1 + v];
+            const double of_exponent = of_value * own.slope;
+            if (of_exponent == 0) continue;
+            temperature_gradient[range] -= of_exponent * own.exponent / views.temperature;
+            const double of_length = of_exponent / views.temperature;  // of the dual length
+            views.view[v].add_ratio_gradient(pair, of_length * own.length, gradients[v]);
+            if (!views.in_px) continue;
+            const Point i = views.view[v].first(pair), j = views.view[v].second(pair);
+            const double scale = of_length * own.ratio / own.length;
+            DualEdges::add(gradients[v], pairs[2 * pair + 1], scale * (j.x - i.x), scale * (j.y - i.y));
+            DualEdges::add(gradients[v], pairs[2 * pair], -scale * (j.x - i.x), -scale * (j.y - i.y));
+        }
+    });
+}
+
+}  // namespace tensor_stereo

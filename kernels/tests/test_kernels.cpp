@@ -14,6 +14,8 @@
 #include "tensor_stereo/one_to_one.hpp"
 #include "tensor_stereo/predicates.hpp"
 #include "tensor_stereo/row_overlap.hpp"
+#include "tensor_stereo/soft_counts.hpp"
+#include "tensor_stereo/soft_match_graphs.hpp"
 #include "tensor_stereo/triangulation.hpp"
 
 namespace ts = tensor_stereo;
@@ -248,6 +250,122 @@ void test_gated_ssd_takes_the_lowest_index_of_equals() {
     EXPECT(index1[0] == 0 && index1[1] == 0 && index1[2] == -1 && index1[3] == -1);
 }
 
+// Two views of the same points, of which some are moved, in segments of 20.
+struct SoftSample {
+    std::vector<double> points[2];
+    std::vector<std::int64_t> index, ptr{0};
+
+    SoftSample(Rng& rng, int num_segments, int range) {
+        for (int s = 0; s < num_segments; ++s) {
+            auto points0 = random_integers(rng, 20, range);
+            std::shuffle(points0.begin(), points0.end(), rng);
+            auto points1 = points0;
+            std::shuffle(points1.begin(), points1.begin() + static_cast<std::ptrdiff_t>(points1.size() / 2), rng);
+            for (std::size_t k = 0; k < points0.size(); ++k) {
+                points[0].insert(points[0].end(), {points0[k].x, points0[k].y});
+                points[1].insert(points[1].end(), {points1[k].x, points1[k].y});
+                index.push_back(static_cast<std::int64_t>(index.size()));
+            }
+            ptr.push_back(static_cast<std::int64_t>(index.size()));
+        }
+    }
+
+    std::int64_t count() const { return static_cast<std::int64_t>(index.size()); }
+
+    ts::SoftMatchGraphs build(ts::Reach reach, int num_threads) const {
+        return ts::soft_match_graphs(points[0].data(), points[1].data(), count(), index.data(), ptr.data(),
+                                     static_cast<std::int64_t>(ptr.size()) - 1, 1e-3, reach, num_threads);
+    }
+
+    ts::SoftViews views(const ts::SoftMatchGraphs& found, double temperature, bool in_px) const {
+        const auto edges = [&](int v) {
+            return ts::DualEdges{points[v].data(), found.pairs.get(), found.view[v].critical.get(), 1e3};
+        };
+        return {{edges(0), edges(1)},
+                {found.view[0].is_edge.get(), found.view[1].is_edge.get()},
+                {found.pair_ptr.get(), static_cast<std::int64_t>(ptr.size()) - 1},
+                temperature,
+                40,
+                in_px};
+    }
+};
+
+void test_critical_points_leave_their_side_of_the_circle_empty() {
+    Rng rng(4);
+    for (const int range : {2, 5, 300}) {
+        const SoftSample sample(rng, 30, range);
+        const auto found = sample.build({1e9, 0}, 1);
+        for (int v = 0; v < 2; ++v) {
+            const double* const values = sample.points[v].data();
+            const auto point = [values](std::int64_t row) { return ts::Point{values[2 * row], values[2 * row + 1]}; };
+            for (std::size_t s = 0; s + 1 < sample.ptr.size(); ++s) {
+                for (std::int64_t e = found.pair_ptr[s]; e < found.pair_ptr[s + 1]; ++e) {
+                    const std::int64_t i = found.pairs[2 * e], j = found.pairs[2 * e + 1];
+                    for (int side = 0; side < 2; ++side) {
+                        const std::int64_t best = found.view[v].critical[2 * e + side];
+                        if (best == ts::kBlocked) continue;
+                        const auto a = side == 1 ? i : j, b = side == 1 ? j : i;  // the side on the left of a -> b
+                        for (std::int64_t k = sample.ptr[s]; k < sample.ptr[s + 1]; ++k) {
+                            if (k == i || k == j || ts::exact_orientation(point(a), point(b), point(k)) <= 0) continue;
+                            EXPECT(best != ts::kNone);
+                            EXPECT(ts::exact_incircle(point(a), point(b), point(best), point(k)) <= 0);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+void test_soft_match_graphs_do_not_depend_on_threads() {
+    Rng rng(5);
+    const SoftSample sample(rng, 40, 6);
+    const auto one = sample.build({4, 0}, 1), many = sample.build({4, 0}, 4);
+    EXPECT(one.num_pairs == many.num_pairs);
+    EXPECT(std::equal(one.pairs.get(), one.pairs.get() + 2 * one.num_pairs, many.pairs.get()));
+    for (int v = 0; v < 2; ++v) {
+        const auto* const critical = one.view[v].critical.get();
+        EXPECT(std::equal(critical, critical + 2 * one.num_pairs, many.view[v].critical.get()));
+    }
+}
+
+void test_gradient_of_soft_counts_is_that_of_finite_differences() {
+    Rng rng(6);
+    for (const bool in_px : {false, true}) {
+        SoftSample sample(rng, 3, 1000);
+        const auto found = sample.build({16, 0}, 1);
+        const auto n = static_cast<std::size_t>(sample.count());
+        std::vector<double> weights(3 * n);
+        for (std::size_t k = 0; k < weights.size(); ++k) weights[k] = std::sin(static_cast<double>(k));
+        const auto loss = [&](double temperature) {
+            std::vector<double> counts(3 * n, 0.0);
+            ts::soft_counts(sample.views(found, temperature, in_px), 2, counts.data());
+            double sum = 0;
+            for (std::size_t k = 0; k < counts.size(); ++k) sum += weights[k] * counts[k];
+            return sum;
+        };
+        const double temperature = in_px ? 150 : 1;
+        std::vector<double> gradient[2] = {std::vector<double>(2 * n, 0.0), std::vector<double>(2 * n, 0.0)}, partial(3, 0.0);
+        ts::soft_counts_backward(sample.views(found, temperature, in_px), weights.data(), 2, gradient[0].data(),
+                                 gradient[1].data(), partial.data());
+        const double step = 1e-4;
+        for (int v = 0; v < 2; ++v) {
+            for (std::size_t k = 0; k < 2 * n; k += 7) {
+                const double before = sample.points[v][k];
+                sample.points[v][k] = before + step;
+                const double above = loss(temperature);
+                sample.points[v][k] = before - step;
+                const double below = loss(temperature);
+                sample.points[v][k] = before;
+                EXPECT(std::fabs((above - below) / (2 * step) - gradient[v][k]) < 1e-6 * (1 + std::fabs(gradient[v][k])));
+            }
+        }
+        const double of_temperature = partial[0] + partial[1] + partial[2];
+        const double difference = (loss(temperature + step) - loss(temperature - step)) / (2 * step);
+        EXPECT(std::fabs(difference - of_temperature) < 1e-6 * (1 + std::fabs(of_temperature)));
+    }
+}
+
 }  // namespace
 
 int main() {
@@ -259,6 +377,9 @@ int main() {
         {"degenerate and adversarial inputs end", test_degenerate_and_adversarial_inputs_end},
         {"row overlap counts shared columns", test_row_overlap_counts_shared_columns},
         {"one-to-one is greedy by cost", test_one_to_one_is_greedy_by_cost},
+        {"critical points leave their side of the circle empty", test_critical_points_leave_their_side_of_the_circle_empty},
+        {"soft match graphs do not depend on threads", test_soft_match_graphs_do_not_depend_on_threads},
+        {"gradient of soft counts", test_gradient_of_soft_counts_is_that_of_finite_differences},
         {"gated SSD takes the lowest index of equals", test_gated_ssd_takes_the_lowest_index_of_equals},
     };
     for (const auto& [name, test] : tests) {

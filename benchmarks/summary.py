@@ -32,9 +32,8 @@ def print_comparisons(*suites: str) -> None:
 
 def print_scores() -> None:
     """How the soft score ranks matches beside the hard one."""
-    print(
-        "| putative matches | AUC hard | AUC soft | specificity at sensitivity .96, hard | soft |\n|---|---|---|---|---|"
-    )
+    print("| putative matches | AUC hard | AUC soft | specificity at sensitivity .96, hard | soft |")
+    print("|---|---|---|---|---|")
     found = {r["title"]: r for r in records("soft") if "auc" in r}
     for title, hard in found.items():
         name, kind = title.rsplit(", ", 1)

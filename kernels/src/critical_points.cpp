@@ -62,28 +62,21 @@ bool CriticalPoints::across(Index h, Critical& found) const noexcept {
 Critical CriticalPoints::find_in_mesh(Index i, Index j) {
     const Index* const origin = mesh_->origin.data();
     const Index* const twin = mesh_->twin.data();
-    const Index first = fan_[i];
-    for (Index h = first;;) {
-        if (origin[next_in_triangle(h)] == j) return in_reach(h, of_half_edge(h));
-        const Index back = previous_in_triangle(h);
-        if (twin[back] == kNone) {
-            if (origin[back] == j) return in_reach(back, of_half_edge(back)).reversed();
-            break;
-        }
-        h = twin[back];
-        if (h == first) break;
-    }
     const Point p = mesh_->points[i], q = mesh_->points[j];
     const auto is_ahead = [&](Index v) {
         const Point r = mesh_->points[v];
         return p.x == q.x ? (r.y > p.y) == (q.y > p.y) : (r.x > p.x) == (q.x > p.x);
     };
-    int right = turn(i, origin[next_in_triangle(first)], j);
-    if (right == 0 && is_ahead(origin[next_in_triangle(first)])) return {kBlocked, kBlocked, false};
+    constexpr Critical kIsBlocked{kBlocked, kBlocked, false};
+    const Index first = fan_[i], first_end = origin[next_in_triangle(first)];
+    int right = turn(i, first_end, j);
+    if (right == 0 && first_end == j) return in_reach(first, of_half_edge(first));
+    if (right == 0 && is_ahead(first_end)) return kIsBlocked;
     for (Index h = first;;) {
-        const Index back = previous_in_triangle(h);
-        const int left = turn(i, origin[back], j);
-        if (left == 0 && is_ahead(origin[back])) return {kBlocked, kBlocked, false};
+        const Index back = previous_in_triangle(h), end = origin[back];
+        const int left = turn(i, end, j);
+        if (left == 0 && end == j) return in_reach(back, of_half_edge(back)).reversed();
+        if (left == 0 && is_ahead(end)) return kIsBlocked;
         if (right > 0 && left < 0) return to_input(walk(i, j, h));
         right = left;
         h = twin[back];

@@ -73,6 +73,8 @@ def filter_disparity(
         raise TypeError(f"disparity must be float32 or float64, got {disparity.dtype}")
     if disparity.ndim != 4 or disparity.shape[1] != 1:
         raise ValueError(f"disparity must have shape (B, 1, H, W), got {tuple(disparity.shape)}")
+    if not isinstance(stride, int):
+        raise TypeError(f"stride must be an integer number of px, got {stride!r}")
     if stride < 1:
         raise ValueError(f"stride must be at least 1 px, got {stride}")
     if mask is not None and mask.dtype != torch.bool:

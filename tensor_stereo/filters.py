@@ -64,6 +64,7 @@ def classify_graphs(
     """The set tests of :func:`classify_matches` on graphs that exist already.
 
     Example:
+        >>> import torch
         >>> left = torch.tensor([[0.0, 0.0], [9.0, 1.0], [1.0, 8.0]])
         >>> graphs = build_match_graphs(Matches(left, left - 2, torch.tensor([0, 3])))
         >>> classify_graphs(graphs, min_group_size=3).relation

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded
 from tensor_stereo.configs import Backend, Restriction, TemperatureUnit
 from tensor_stereo.filters import FilterOutput, classify_graphs
-from tensor_stereo.soft import SoftGraphs, build_soft_graphs, count_soft_neighbors, soft_jaccard
+from tensor_stereo.ops import resolve_backend
+from tensor_stereo.soft import (
+    COLDEST,
+    HOTTEST,
+    SoftGraphs,
+    build_soft_graphs,
+    check_temperature,
+    count_soft_neighbors,
+    soft_jaccard,
+)
 from tensor_stereo.types import Classification, Matches, Relation
 
 UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
@@ -32,7 +43,7 @@ class DelaunayFilter(nn.Module):
         backend: as in :func:`tensor_stereo.classify_matches`.
 
     Raises:
-        ValueError: for an unknown option or a temperature that is not positive.
+        ValueError: for an unknown option, or a temperature outside 1e-9..1e9.
 
     Source: the verdict is Bustos, Vargas & Trujillo, CIARP 2016, section 3; the score is this library's.
 
@@ -67,8 +78,12 @@ class DelaunayFilter(nn.Module):
             raise ValueError(f"score must be 'topology', got {score!r}")
         if unit not in ("edge", "px"):
             raise ValueError(f"unit must be 'edge' or 'px', got {unit!r}")
-        if not 0 < temperature < float("inf"):
-            raise ValueError(f"temperature must be positive and finite, got {temperature}")
+        check_temperature(temperature)
+        if not 0 <= tie_tolerance < 1:
+            raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
+        if threshold is not None and not 0 <= threshold <= 1:
+            raise ValueError(f"threshold must lie in [0, 1] or be None, got {threshold}")
+        resolve_backend(backend)
         if min_group_size < 1:
             raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
         self.restriction = restriction
@@ -87,8 +102,13 @@ class DelaunayFilter(nn.Module):
 
     @property
     def temperature(self) -> Tensor:
-        """() float64, in ``unit``."""
-        return self.log_temperature.exp()
+        """() float64, in ``unit``, whatever the dtype that the module is moved to."""
+        return self.log_temperature.exp().clamp(COLDEST, HOTTEST)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DelaunayFilter:
+        """Follow a move to another device, but not one to another dtype: the score is computed in float64."""
+        super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)  # type: ignore[no-untyped-call]
+        return self
 
     def forward(
         self,
@@ -110,13 +130,17 @@ class DelaunayFilter(nn.Module):
         Returns:
             ``inlier``, ``score`` and ``relation`` in the layout of the input. The score has the dtype of the keypoints,
             under autocast that of autocast. Gradients flow from it to both keypoints and the temperature, and are zero
-            for untested matches.
+            for untested matches; not differentiable twice.
 
         Raises:
             ValueError: if shapes disagree, or as :func:`tensor_stereo.classify_matches`.
-            TypeError: for keypoints in half precision, which cannot tell pixels apart beyond 256.
+            TypeError: for keypoints in half precision, which cannot tell pixels apart beyond 256; for arguments beside
+                ``Matches``.
         """
         if isinstance(keypoints0, Matches):
+            rest = {"keypoints1": keypoints1, "mask": mask, "group": group, "cost": cost}
+            for name in (name for name, value in rest.items() if value is not None):
+                raise TypeError(f"{name} must be part of the Matches, not given beside them")
             return FilterOutput(*self._classify(keypoints0), keypoints0)
         mask = _check_padded(keypoints0, keypoints1, mask, group, cost)
         rows0, ptr = from_padded(keypoints0, mask)
@@ -135,13 +159,13 @@ class DelaunayFilter(nn.Module):
         )
         score = self._score(matches, found, verdict)
         is_tested = verdict.relation != UNTESTED
+        device = matches.keypoints0.device.type
+        low = torch.is_autocast_enabled(device)
+        score = score.to(torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype)
         inlier = verdict.inlier if self.threshold is None else is_tested & (score.detach() >= self.threshold)
         if self.straight_through:
             score = score + (inlier.to(score.dtype) - score).detach()
-        device = matches.keypoints0.device.type
-        low = torch.is_autocast_enabled(device)
-        dtype = torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype
-        return inlier, score.to(dtype), verdict.relation
+        return inlier, score, verdict.relation
 
     def _score(self, matches: Matches, found: SoftGraphs, verdict: Classification) -> Tensor:
         """(M,) float64."""
@@ -158,6 +182,9 @@ def _check_padded(
     """The mask; raises unless all shapes fit."""
     if keypoints1 is None:
         raise ValueError("keypoints1 must be given with keypoints0")
+    for name, given in (("keypoints0", keypoints0), ("keypoints1", keypoints1)):
+        if not torch.is_tensor(given):
+            raise TypeError(f"{name} must be a tensor, got {type(given).__name__}")
     if keypoints0.ndim != 3 or keypoints0.shape[2] != 2:
         raise ValueError(f"keypoints0 must have shape (B, N, 2), got {tuple(keypoints0.shape)}")
     for name, value, shape in (

@@ -2,7 +2,8 @@
 
 An edge of the graph has a dual Voronoi edge of positive length; that length, over a temperature, makes the membership
 soft. Keypoints are differentiable; which points bound a dual edge is not, so gradients have kinks where two points tie
-for it, and stay finite everywhere.
+for it or where both views agree on a pair, and stay finite everywhere. Nothing here is differentiable twice, nor in
+forward mode.
 """
 
 from __future__ import annotations
@@ -11,14 +12,17 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from tensor_stereo import ops
 from tensor_stereo.configs import Backend, TemperatureUnit
 from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.types import Adjacency, Matches
+from tensor_stereo.types import Adjacency, Matches, check_pairs, check_points
 
 SATURATION = 40.0  # |length / temperature| beyond which an adjacency is constant
 REACH = 16.0  # temperatures of negative length below which a pair counts as blocked; its adjacency is below 1.2e-7
+COLDEST, HOTTEST = 1e-9, 1e9  # temperatures
+_TIE = 1e-9  # adjacencies closer than that share the gradient of their minimum
 _UNBOUNDED = 2.0**30  # edge lengths to which dual edges are clipped where the tolerance does not
 
 
@@ -59,7 +63,8 @@ def build_soft_graphs(
     """The graphs of both views, and the pairs of matches whose soft adjacency counts.
 
     In either view these are the edges of the exact graph; the two critical points of each edge if their segment crosses
-    it, so that an ordinary flip enters and leaves without a jump; and the chords of co-circular polygons.
+    it, so that an ordinary flip enters and leaves without a jump; and the chords of co-circular polygons with at most
+    16 corners.
 
     Args:
         matches: B pairs; ``group`` splits each pair into objects.
@@ -67,13 +72,15 @@ def build_soft_graphs(
             blocked.
         unit: ``edge``: in lengths of the pair; ``px``: in pixels.
         tie_tolerance: as in :func:`tensor_stereo.build_graphs`.
-        backend: as in :func:`tensor_stereo.build_graphs`.
+        backend: as in :func:`tensor_stereo.build_graphs`. Without native kernels all pairs are held against all points:
+            3 s for 1000 matches, growing with the square.
 
     Returns:
         Graphs and pairs. No gradient.
 
     Raises:
-        ValueError: as :func:`tensor_stereo.graphs.build_match_graphs`, or for an unknown ``unit``.
+        ValueError: as :func:`tensor_stereo.graphs.build_match_graphs`, for an unknown ``unit``, or a temperature that
+            is no number between 1e-9 and 1e9.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
@@ -82,7 +89,7 @@ def build_soft_graphs(
     """
     _check_unit(unit)
     like = matches.keypoints0
-    reach = REACH * torch.as_tensor(temperature, dtype=torch.float64, device=like.device).detach()
+    reach = REACH * _to_temperature(temperature, like.device).detach()
     none = torch.zeros_like(reach)
     found = ops.soft_match_graphs(
         like.detach(),
@@ -166,6 +173,7 @@ def dual_edge_length(
         tensor([0.7500], dtype=torch.float64)
     """
     points = _to_float64("keypoints", keypoints)
+    check_pairs("pairs", pairs, len(points))
     ratio = _ratio(points, pairs, critical, pair_ptr, tie_tolerance, backend)
     return ratio * pair_length(points, pairs)
 
@@ -173,9 +181,8 @@ def dual_edge_length(
 def pair_length(keypoints: Tensor, pairs: Tensor) -> Tensor:
     """(E,) distance of the two points of each pair in px; gradients flow.
 
-    Example:
-        >>> pair_length(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.tensor([[0, 1]]))
-        tensor([5.])
+    >>> pair_length(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.tensor([[0, 1]]))
+    tensor([5.])
     """
     i, j = pairs.unbind(1)
     length: Tensor = torch.linalg.vector_norm(keypoints.index_select(0, j) - keypoints.index_select(0, i), dim=1)
@@ -196,7 +203,8 @@ def soft_adjacency(
     """How much each pair is an edge: the sigmoid of its dual length over the temperature.
 
     The sign of the length is that of the hard graph, so that the limit of temperature 0 is the hard graph wherever the
-    length is not zero; at a tie the adjacency is 1/2. |length / temperature| is cut at :data:`SATURATION`.
+    length is not zero; where the tolerance has turned the sign, the gradient is still that of the length itself. At a
+    tie the adjacency is 1/2. |length / temperature| is cut at :data:`SATURATION`.
 
     Args:
         keypoints: (M, 2) float32 or float64 px of one view.
@@ -219,13 +227,14 @@ def soft_adjacency(
     """
     _check_unit(unit)
     points = _to_float64("keypoints", keypoints)
+    check_pairs("pairs", pairs, len(points))
     length = _ratio(points, pairs, geometry.critical, pair_ptr, tie_tolerance, backend)
     if unit == "px":
         length = length * pair_length(points, pairs)
     with torch.no_grad():  # rounding and the tolerance must not contradict the hard graph, nor turn the gradient
         signed = torch.where(geometry.is_edge, length.abs(), -length.abs())
     length = length + (signed - length).detach()
-    return torch.sigmoid((length / temperature).clamp(-SATURATION, SATURATION))
+    return torch.sigmoid((length / _to_temperature(temperature, length.device)).clamp(-SATURATION, SATURATION))
 
 
 def soft_counts(adjacency0: Tensor, adjacency1: Tensor, pairs: Tensor, num_matches: int) -> SoftCounts:
@@ -238,15 +247,18 @@ def soft_counts(adjacency0: Tensor, adjacency1: Tensor, pairs: Tensor, num_match
         num_matches: M.
 
     Returns:
-        Sums of min, max and both adjacencies over the pairs of each match. Gradients flow; at a tie of min and max half
-        to each.
+        Sums of min, max and both adjacencies over the pairs of each match. Gradients flow; where both adjacencies
+        agree, half to each.
 
     Example:
         >>> half = torch.tensor([0.5])
         >>> soft_counts(half, 2 * half, torch.tensor([[0, 1]]), 2).union
         tensor([1., 1.])
     """
-    shared = torch.minimum(adjacency0, adjacency1)
+    # Where both agree, rounding must not decide which of them gets the gradient of the lesser.
+    share = (0.5 + (adjacency1 - adjacency0).detach() / (2 * _TIE)).clamp(0, 1)
+    shared = share * adjacency0 + (1 - share) * adjacency1
+    shared = shared + (torch.minimum(adjacency0, adjacency1) - shared).detach()
     values = torch.stack([shared, adjacency0, adjacency1], 1)  # (E, 3)
     zeros = values.new_zeros(num_matches, 3)
     i, j = pairs.unbind(1)
@@ -309,7 +321,7 @@ def count_soft_neighbors(
         found.view0.is_edge,
         found.view1.is_edge,
         found.pair_ptr,
-        torch.as_tensor(temperature, dtype=torch.float64, device=points0.device),
+        _to_temperature(temperature, points0.device),
         SATURATION,
         unit == "px",
         _bound(tie_tolerance),
@@ -356,13 +368,35 @@ def _ratio(
 
 def _bound(tie_tolerance: float) -> float:
     """Edge lengths to which the ends of dual edges are clipped."""
+    if not 0 <= tie_tolerance < 1:
+        raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
     return 1 / tie_tolerance if tie_tolerance > 0 else _UNBOUNDED
 
 
 def _to_float64(name: str, keypoints: Tensor) -> Tensor:
-    if keypoints.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name} must be float32 or float64 pixels, got {keypoints.dtype}")
+    check_points(name, keypoints)
+    if not torch.compiler.is_compiling() and forward_ad.unpack_dual(keypoints).tangent is not None:  # type: ignore[no-untyped-call]
+        raise NotImplementedError(f"{name} carries a tangent, but the soft score has no forward mode")
     return keypoints.to(torch.float64)
+
+
+def _to_temperature(temperature: Tensor | float, device: torch.device) -> Tensor:
+    """() float64."""
+    value = torch.as_tensor(temperature, dtype=torch.float64, device=device)
+    if value.ndim != 0:
+        raise ValueError(f"temperature must be a number, got shape {tuple(value.shape)}")
+    if not torch.compiler.is_compiling():
+        check_temperature(value.item())
+    return value
+
+
+def check_temperature(temperature: float) -> None:
+    """Raise unless 1e-9 <= temperature <= 1e9, where gradients are finite in float32 too.
+
+    >>> check_temperature(1.0)
+    """
+    if not COLDEST <= temperature <= HOTTEST:
+        raise ValueError(f"temperature must lie in [{COLDEST:g}, {HOTTEST:g}], got {temperature}")
 
 
 def _check_unit(unit: str) -> None:

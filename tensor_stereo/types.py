@@ -244,3 +244,11 @@ def check_integer(name: str, values: Tensor) -> None:
     """Raise unless ``values`` holds integers."""
     if values.is_floating_point() or values.is_complex() or values.dtype == torch.bool:
         raise TypeError(f"{name} must hold integers, got {values.dtype}")
+
+
+def check_pairs(name: str, pairs: Tensor, num_rows: int) -> None:
+    """Raise unless ``pairs`` is (E, 2) int64 and names rows below ``num_rows``."""
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype != torch.int64:
+        raise ValueError(f"{name} must be (E, 2) int64, got {tuple(pairs.shape)} {pairs.dtype}")
+    if not torch.compiler.is_compiling() and len(pairs) and not (pairs.min() >= 0 and pairs.max() < num_rows):
+        raise ValueError(f"{name} must name rows 0..{num_rows - 1}, got {int(pairs.min())}..{int(pairs.max())}")

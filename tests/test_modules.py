@@ -125,6 +125,9 @@ def test_threshold_replaces_the_restriction() -> None:
     output = ts.DelaunayFilter(threshold=0.6)(left, right)
     tested = output.relation != ts.Relation.UNTESTED
     assert torch.equal(output.inlier, tested & (output.score >= 0.6))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        low = ts.DelaunayFilter(threshold=0.6)(left, right)
+    assert torch.equal(low.inlier, (low.relation != ts.Relation.UNTESTED) & (low.score >= 0.6))
     assert not torch.equal(output.inlier, ts.DelaunayFilter()(left, right).inlier)
 
 
@@ -251,6 +254,10 @@ def test_cuda_tensors_come_back_on_their_device() -> None:
         ({"unit": "cm"}, "unit"),
         ({"temperature": 0.0}, "temperature"),
         ({"temperature": np.nan}, "temperature"),
+        ({"threshold": 7.0}, "threshold"),
+        ({"threshold": np.nan}, "threshold"),
+        ({"tie_tolerance": 5.0}, "tie_tolerance"),
+        ({"backend": "foo"}, "backend"),
         ({"min_group_size": 0}, "min_group_size"),
     ],
 )
@@ -259,6 +266,17 @@ def test_unknown_options_are_refused(arguments: dict[str, object], message: str)
         ts.DelaunayFilter(**arguments)  # type: ignore[arg-type]
 
 
-def test_keypoints1_must_come_with_keypoints0() -> None:
+def test_arguments_that_do_not_fit_together_are_refused() -> None:
+    module, (left, right) = ts.DelaunayFilter(), _padded()
     with pytest.raises(ValueError, match="keypoints1"):
-        ts.DelaunayFilter()(torch.rand(1, 5, 2))
+        module(left)
+    with pytest.raises(TypeError, match="keypoints0 must be a tensor"):
+        module(left.numpy(), right.numpy())
+    with pytest.raises(TypeError, match="cost"):
+        module(module(left, right).matches, cost=torch.zeros(1))
+
+
+def test_a_move_to_another_dtype_keeps_the_temperature() -> None:
+    for module in (ts.DelaunayFilter(temperature=3.0), ts.DelaunayFilter(temperature=3.0, learnable_temperature=True)):
+        assert module.half().temperature.item() == pytest.approx(3.0, rel=1e-15)
+        assert module.temperature.dtype == torch.float64

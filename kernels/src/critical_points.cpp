@@ -12,8 +12,12 @@ void CriticalPoints::prepare(const Triangulation& mesh, const GraphEdges& edges)
     for (Index v = 0; v < count; ++v) rank_[mesh.vertex[v]] = v;
     if (mesh.is_collinear) return;
     fan_.resize(count);
+    degree_.assign(count, 0);
     const auto half_edges = static_cast<Index>(mesh.origin.size());
-    for (Index h = 0; h < half_edges; ++h) fan_[mesh.origin[h]] = h;
+    for (Index h = 0; h < half_edges; ++h) {
+        fan_[mesh.origin[h]] = h;
+        ++degree_[mesh.origin[h]];
+    }
     for (Index h = 0; h < half_edges; ++h) {
         if (mesh.twin[h] == kNone) fan_[mesh.origin[h]] = h;
     }
@@ -25,7 +29,7 @@ Critical CriticalPoints::find(Index i, Index j) {
         const bool is_edge = std::abs(a - b) == 1;
         return {is_edge ? kNone : kBlocked, is_edge ? kNone : kBlocked, is_edge};
     }
-    return find_in_mesh(a, b);
+    return degree_[a] <= degree_[b] ? find_in_mesh(a, b) : find_in_mesh(b, a).reversed();
 }
 
 Critical CriticalPoints::to_input(Critical found) const noexcept {
@@ -80,6 +84,7 @@ Critical CriticalPoints::find_in_mesh(Index i, Index j) {
         if (right > 0 && left < 0) return to_input(walk(i, j, h));
         right = left;
         h = twin[back];
+        if (h == kNone) return kIsBlocked;  // not in a triangulation
     }
 }
 
@@ -110,7 +115,7 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
         cross = dx * y - dy * x;
         const double inverse = 1 / std::fabs(cross), value = 0.5 * inverse * (x * (x - dx) + y * (y - dy));
         const double size = std::fabs(x) + std::fabs(y);
-        return {value, 1e-15 * inverse * size * (size + (1 + 2 * std::fabs(value)) * span)};
+        return {value, 1.1e-15 * inverse * size * (size + (1 + 2 * std::fabs(value)) * span)};
     };
     const Index first_right = origin[next_in_triangle(h)], first_left = origin[previous_in_triangle(h)];
     right_.start(first_right, twin[h], look(first_right));
@@ -197,15 +202,18 @@ double CriticalPoints::reach(Index i, Index j) const noexcept {
     return reach_.edge_lengths + reach_.px / std::sqrt(dx * dx + dy * dy);
 }
 
-// Whether the dual of {i, j} is too negative, always computed from the vertex that comes first in the input.
+// Whether the dual of {i, j} may be too negative, always computed from the vertex that comes first in the input.
 bool CriticalPoints::is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept {
     if (mesh_->vertex[i] > mesh_->vertex[j]) return is_out_of_reach(j, i, left, right);
     const double limit = reach(i, j);
-    return !std::isinf(limit) && !(end(i, j, left) + end(i, j, right) >= -limit);
+    return !std::isinf(limit) && !(least_end(i, j, left) + least_end(i, j, right) >= -limit);
 }
 
-double CriticalPoints::end(Index i, Index j, Index k) const noexcept {
-    return dual_end(mesh_->points[i], mesh_->points[j], mesh_->points[k]);
+// An end less what rounding may have added to it.
+double CriticalPoints::least_end(Index i, Index j, Index k) const noexcept {
+    const Point* const p = mesh_->points.data();
+    const double value = dual_end(p[i], p[j], p[k]);
+    return value - dual_end_error(p[i], p[j], p[k], value);
 }
 
 bool CriticalPoints::is_before(Index v, Index w) const noexcept {

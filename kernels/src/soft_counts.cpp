@@ -6,6 +6,8 @@
 namespace tensor_stereo {
 namespace {
 
+constexpr double kTie = 1e-9;  // adjacencies closer than that share their gradient
+
 struct Adjacency {
     double value;     // of the sigmoid
     double slope;     // of the value by the dual length in units of the temperature
@@ -26,6 +28,11 @@ inline Adjacency adjacency(const SoftViews& views, int v, std::int64_t pair) noe
     result.value = 1 / (1 + std::exp(-result.exponent));
     result.slope = size <= views.saturation ? result.value * (1 - result.value) : 0;
     return result;
+}
+
+// How much of the gradient of min(own, other) goes to own: half where both agree but for rounding.
+inline double share_of_minimum(double own, double other) noexcept {
+    return std::min(std::max(0.5 + (other - own) / (2 * kTie), 0.0), 1.0);
 }
 
 }  // namespace
@@ -54,7 +61,7 @@ void soft_counts_backward(const SoftViews& views, const double* counts_gradient,
         for (int v = 0; v < 2; ++v) {
             const Adjacency& own = both[v];
             if (own.slope == 0) continue;
-            const double other = both[1 - v].value, share = own.value < other ? 1 : own.value > other ? 0 : 0.5;
+            const double other = both[1 - v].value, share = share_of_minimum(own.value, other);
             const double of_value = share * (of_i[0] + of_j[0]) + of_i[1 + v] + of_j[1 + v];
             const double of_exponent = of_value * own.slope;
             if (of_exponent == 0) continue;

@@ -16,6 +16,8 @@ namespace {
 // visit(i, j, nullptr) for pairs whose critical points must be searched, among them the chords of co-circular polygons.
 class PairCollector {
    public:
+    static constexpr std::size_t kMostCorners = 16;  // the chords of larger polygons are not listed: there are too many
+
     template <class Visit>
     void collect(const Triangulation& mesh, const GraphEdges& edges, const CriticalPoints& points, const Visit& visit) {
         const Index* const vertex = mesh.vertex.data();
@@ -64,6 +66,7 @@ class PairCollector {
             if (polygon_.size() == 3) continue;
             std::sort(polygon_.begin(), polygon_.end());
             polygon_.erase(std::unique(polygon_.begin(), polygon_.end()), polygon_.end());
+            if (polygon_.size() > kMostCorners) continue;
             for (std::size_t a = 0; a < polygon_.size(); ++a) {
                 for (std::size_t b = a + 1; b < polygon_.size(); ++b) visit(polygon_[a], polygon_[b], nullptr);
             }

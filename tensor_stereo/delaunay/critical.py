@@ -14,6 +14,7 @@ from tensor_stereo.delaunay.mesh import HULL, Int, Mesh
 from tensor_stereo.delaunay.predicates import Float, incircle, orientation
 
 BLOCKED = -2  # a point lies between the two, or the dual edge is out of reach
+MOST_CORNERS = 16  # the chords of larger co-circular polygons are not listed: there are too many
 _CHUNK = 2**18  # pairs x points that are compared at a time
 
 
@@ -21,7 +22,7 @@ def soft_pairs(views: list[Float], ptr: Int, *, num_threads: int) -> tuple[Int, 
     """Pairs that count in at least one of several point sets over the same segments.
 
     They are the edges of the exact graphs, for each edge with critical points on both sides that pair if it crosses the
-    edge, and the chords of co-circular polygons.
+    edge, and the chords of co-circular polygons with at most ``MOST_CORNERS`` corners.
 
     Args:
         views: (N, 2) float64 each.
@@ -56,8 +57,8 @@ def _mesh_pairs(points: Float, mesh: Mesh) -> list[Int]:
         polygon = polygons(mesh)
         order = np.argsort(polygon, kind="stable")
         for members in np.split(mesh.triangles[order], np.flatnonzero(np.diff(polygon[order])) + 1):
-            if len(members) > 1:
-                vertices = np.unique(members)
+            vertices = np.unique(members)
+            if len(members) > 1 and len(vertices) <= MOST_CORNERS:
                 found.append(np.stack(np.triu_indices(len(vertices), 1), 1))
                 found[-1] = vertices[found[-1]]
     return found
@@ -103,19 +104,21 @@ def _search(points: Float, pairs: Int) -> Int:
     unsure = is_third & ~(np.abs(cross) > 1e-14 * (np.abs(dx * y) + np.abs(dy * x)))
     pair, point = np.nonzero(unsure)
     side[pair, point] = orientation(i[pair], j[pair], points[point])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         end = along / (2 * np.abs(cross))
         reach, span = np.abs(x) + np.abs(y), np.abs(dx) + np.abs(dy)
         error = 1e-15 * reach * (reach + (1 + 2 * np.abs(end)) * span) / np.abs(cross)
     found = [_best(points, pairs, is_third & (side == sign), end, error, sign) for sign in (-1, 1)]
     result = np.stack(found, 1)
-    result[(is_third & (side == 0) & (along < 0)).any(1)] = BLOCKED
+    low, high = np.minimum(i, j)[:, None], np.maximum(i, j)[:, None]  # products may round, comparisons do not
+    is_between = ((points[None] >= low) & (points[None] <= high)).all(2)
+    result[(is_third & (side == 0) & is_between).any(1)] = BLOCKED
     return result
 
 
 def _best(points: Float, pairs: Int, candidate: NDArray[np.bool_], end: Float, error: Float, sign: int) -> Int:
     """The candidates with the smallest ``end``; exact predicates decide what ``error`` leaves open."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(all="ignore"):
         upper = np.where(candidate, np.where(np.isnan(end + error), np.inf, end + error), np.inf)
         near = candidate & ~(end - error > upper.min(1, keepdims=True, initial=np.inf))
     order = np.argsort(~near, axis=1, kind="stable")
@@ -137,26 +140,18 @@ def _best(points: Float, pairs: Int, candidate: NDArray[np.bool_], end: Float, e
 def limit_reach(points: Float, pairs: Int, critical: Int, *, edge_lengths: float, px: float) -> Int:
     """Mark as blocked what has a dual length below minus (``edge_lengths`` times its length plus ``px``)."""
     between = np.flatnonzero((critical >= 0).all(1))
-    ratio = dual_edge_ratio(points, pairs[between], critical[between], bound=np.inf)
-    length = points[pairs[between, 1]] - points[pairs[between, 0]]
-    limit = edge_lengths + px / np.sqrt(length[:, 0] * length[:, 0] + length[:, 1] * length[:, 1])
-    far = np.isfinite(limit) & ~(ratio >= -limit)
+    i, j = (points[pairs[between, k]] for k in (0, 1))
+    dx, dy = (j - i).T
+    least = []  # ends less what rounding may have added to them
+    with np.errstate(all="ignore"):
+        for k in critical[between].T:
+            x, y = (points[k] - i).T
+            cross = np.abs(dx * y - dy * x)
+            end = (x * (x - dx) + y * (y - dy)) / (2 * cross)
+            size, span = np.abs(x) + np.abs(y), np.abs(dx) + np.abs(dy)
+            least.append(end - 1e-15 * (size * (size + (1 + 2 * np.abs(end)) * span)) / cross)
+        limit = edge_lengths + px / np.sqrt(dx * dx + dy * dy)
+        far = np.isfinite(limit) & ~(least[1] + least[0] >= -limit)
     result = critical.copy()
     result[between[far]] = BLOCKED
     return result
-
-
-def dual_edge_ratio(points: Float, pairs: Int, critical: Int, *, bound: float) -> Float:
-    """Signed lengths of dual Voronoi edges, in lengths of the pair, each end clipped to ``bound`` from the midpoint."""
-    i, j = (points[pairs[:, k]] for k in (0, 1))
-    dx, dy = (j - i).T
-    ends = []
-    for k in critical.T:
-        x, y = (points[np.maximum(k, 0)] - i).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            end = (x * (x - dx) + y * (y - dy)) / (2 * np.abs(dx * y - dy * x))
-            end = np.clip(np.where(np.isnan(end), bound, end), -bound, bound)
-        ends.append(np.where(k == HULL, bound, end))
-    with np.errstate(invalid="ignore"):
-        ratio: Float = np.where(critical[:, 1] == BLOCKED, -2 * bound, ends[0] + ends[1])
-    return ratio

@@ -17,7 +17,7 @@ from tensor_stereo.batching import batch_to_ptr
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.interop.glue_factory import from_glue_factory, to_glue_factory
 from tensor_stereo.modules import DelaunayFilter
-from tensor_stereo.types import Matches, check_vector
+from tensor_stereo.types import Matches, check_integer, check_vector
 
 _ROWS = ("keypoints0", "keypoints1", "confidence", "batch_indexes")  # what LoFTR returns, one row per match
 
@@ -115,6 +115,7 @@ def from_loftr(output: Mapping[str, Any], *, num_pairs: int | None = None) -> Ma
         raise ValueError(f"output must hold {missing[0]!r}, got the keys {sorted(output)}")
     keypoints0 = output["keypoints0"]
     check_vector("batch_indexes", output["batch_indexes"], len(keypoints0))
+    check_integer("batch_indexes", output["batch_indexes"])
     ptr = batch_to_ptr(output["batch_indexes"], num_pairs)
     return Matches(keypoints0, output["keypoints1"], ptr, (1 - output["confidence"]).to(keypoints0.dtype))
 

@@ -13,6 +13,7 @@ from tensor_stereo.duplicates import coincident_ids, first_of_coincident
 from tensor_stereo.ops.backends import kernels
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.ops.segments import check_options, pair_of, segments_of, to_points, vertices_of
+from tensor_stereo.types import check_pairs
 
 
 def _fake(*arguments: Any) -> Tensor:
@@ -41,11 +42,8 @@ def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, p
     """
     choice = check_options(0.0, backend)
     points = to_points("keypoints", keypoints, ptr)
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype != torch.int64:
-        raise ValueError(f"pairs must be (E, 2) int64, got {tuple(pairs.shape)} {pairs.dtype}")
+    check_pairs("pairs", pairs, len(points))
     rows = pairs.numpy(force=True)
-    if rows.size and not (rows.min() >= 0 and rows.max() < len(points)):
-        raise ValueError(f"pairs must name rows 0..{len(points) - 1}, got {rows.min()}..{rows.max()}")
     segment = pair_of(ptr) if group is None else segments_of(ptr, group, len(points))
     kept = first_of_coincident(coincident_ids(points, segment))
     bad = (rows[:, 0] == rows[:, 1]) | (segment[rows[:, 0]] != segment[rows[:, 1]]) | ~kept[rows].all(1)

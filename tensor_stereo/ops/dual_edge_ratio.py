@@ -9,14 +9,14 @@ from torch import Tensor
 
 from tensor_stereo.ops import reference
 from tensor_stereo.ops.backends import kernels, resolve_backend
-from tensor_stereo.ops.registration import operator
+from tensor_stereo.ops.registration import operator, refuse_second_derivative
 
 
 def _fake_backward(points: Tensor, *_: object) -> Tensor:
     return torch.empty_like(points)
 
 
-@operator(_fake_backward)
+@operator(_fake_backward, backward=refuse_second_derivative)
 def dual_edge_ratio_backward(
     points: Tensor, pairs: Tensor, critical: Tensor, pair_ptr: Tensor, gradient: Tensor, bound: float, backend: str
 ) -> Tensor:

@@ -241,7 +241,7 @@ def dual_edge_ratio(points: Tensor, pairs: Tensor, critical: Tensor, bound: floa
             clipped = torch.where(k == -1, bound, end)
         # masked before the division, because where() would turn an unused 0 / 0 into a NaN gradient
         ends.append(torch.where(is_free, along / torch.where(is_free, across, 1), clipped))
-    return torch.where(critical[:, 1] == -2, -2 * bound, ends[0] + ends[1])
+    return torch.where((critical == -2).any(1), -2 * bound, ends[0] + ends[1])
 
 
 def dual_edge_ratio_backward(points: Tensor, pairs: Tensor, critical: Tensor, gradient: Tensor, bound: float) -> Tensor:
@@ -252,6 +252,7 @@ def dual_edge_ratio_backward(points: Tensor, pairs: Tensor, critical: Tensor, gr
     result = torch.zeros_like(points)
     i, j = pairs.unbind(1)
     d = points[j] - points[i]
+    gradient = gradient.masked_fill((critical == -2).any(1), 0)
     for side, k in zip((-1, 1), critical.unbind(1), strict=True):
         along, across, is_free = _dual_end(points, pairs, k, bound)
         q = points[k.clamp(min=0)] - points[i]

@@ -49,3 +49,8 @@ def operator(
         return call
 
     return register
+
+
+def refuse_second_derivative(*_: Any) -> None:
+    """The backward of an operator that is itself one; without it a second derivative would be zero in silence."""
+    raise NotImplementedError("soft counts and dual edge lengths are not differentiable twice")

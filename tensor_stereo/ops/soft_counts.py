@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops.backends import kernels, resolve_backend
-from tensor_stereo.ops.registration import operator
+from tensor_stereo.ops.registration import operator, refuse_second_derivative
 
 Gradients = tuple[Tensor, Tensor, Tensor]
 
@@ -18,7 +18,7 @@ def _fake_backward(*arguments: Any) -> Gradients:
     return torch.empty_like(points0), torch.empty_like(points1), torch.empty_like(temperature)
 
 
-@operator(_fake_backward)
+@operator(_fake_backward, backward=refuse_second_derivative)
 def soft_counts_backward(
     points0: Tensor,
     points1: Tensor,
@@ -46,7 +46,7 @@ def soft_counts_backward(
     resolve_backend("native")
     arrays = _arrays(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, pair_ptr, gradient)
     of_points0, of_points1, of_temperature = kernels.soft_counts_backward(  # type: ignore[union-attr]
-        *arrays, float(temperature), saturation, in_px, bound, torch.get_num_threads()
+        *arrays, temperature.detach().item(), saturation, in_px, bound, torch.get_num_threads()
     )
     to = points0.device
     results = torch.from_numpy(of_points0).to(to), torch.from_numpy(of_points1).to(to)
@@ -116,7 +116,7 @@ def soft_counts(
     resolve_backend("native")
     arrays = _arrays(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, pair_ptr)
     counts = kernels.soft_counts(  # type: ignore[union-attr]
-        *arrays, float(temperature), saturation, in_px, bound, torch.get_num_threads()
+        *arrays, temperature.detach().item(), saturation, in_px, bound, torch.get_num_threads()
     )
     return torch.from_numpy(counts).to(points0.device)
 

@@ -53,7 +53,9 @@ def soft_match_graphs(
     """Graphs of both views, and the pairs whose soft adjacency counts with what bounds their dual Voronoi edges.
 
     The pairs are, in either view, the edges of the exact graph; the critical points of each edge if their segment
-    crosses it, so that an ordinary flip enters and leaves without a jump; and the chords of co-circular polygons.
+    crosses it, so that an ordinary flip enters and leaves without a jump; and the chords of co-circular polygons with
+    at most 16 corners. The native search takes time by the triangles that the pairs cross (quadratic on a parabola
+    facing a line); without kernels all pairs are held against all points.
 
     Args:
         keypoints0: (M, 2) float32 or float64.

@@ -24,6 +24,13 @@ inline double dual_end(Point i, Point j, Point k) noexcept {
     return (x * (x - dx) + y * (y - dy)) / (2 * std::fabs(dx * y - dy * x));
 }
 
+// A bound on the rounding of an end with that value.
+inline double dual_end_error(Point i, Point j, Point k, double value) noexcept {
+    const double dx = j.x - i.x, dy = j.y - i.y, x = k.x - i.x, y = k.y - i.y;
+    const double size = std::fabs(x) + std::fabs(y), span = std::fabs(dx) + std::fabs(dy);
+    return 1e-15 * (size * (size + (1 + 2 * std::fabs(value)) * span)) / std::fabs(dx * y - dy * x);
+}
+
 // Of all points on one side of the line from i to j, the one that sees the segment under the largest angle: the circle
 // through i, j and it has no other point of its side strictly inside. Of several the lexicographically first.
 struct Critical {
@@ -96,7 +103,7 @@ class CriticalPoints {
     Index first_of_polygon(Index h, Index first) const;
     double reach(Index i, Index j) const noexcept;
     bool is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept;
-    double end(Index i, Index j, Index k) const noexcept;
+    double least_end(Index i, Index j, Index k) const noexcept;
     bool is_before(Index v, Index w) const noexcept;
     int turn(Index a, Index b, Index c) const noexcept;
 
@@ -104,6 +111,7 @@ class CriticalPoints {
     const Triangulation* mesh_ = nullptr;
     const GraphEdges* edges_ = nullptr;
     std::vector<Index> fan_;   // of each vertex the half-edge from it that comes first counter-clockwise
+    std::vector<Index> degree_;
     std::vector<Index> rank_;  // number in the mesh of each vertex of the input
     Chain left_, right_;
 };

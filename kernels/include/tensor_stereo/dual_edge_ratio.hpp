@@ -24,7 +24,7 @@ struct DualEdges {
     // Signed length in lengths of the pair; -2 bound where it is blocked.
     double ratio(std::int64_t pair) const noexcept {
         const std::int64_t right = critical[2 * pair], left = critical[2 * pair + 1];
-        if (left == kBlocked) return -2 * bound;
+        if (left == kBlocked || right == kBlocked) return -2 * bound;
         return end(pair, right) + end(pair, left);
     }
 
@@ -32,6 +32,7 @@ struct DualEdges {
     void add_ratio_gradient(std::int64_t pair, double scale, double* gradient) const noexcept {
         const Point i = first(pair), j = second(pair);
         const double dx = j.x - i.x, dy = j.y - i.y;
+        if (critical[2 * pair] == kBlocked || critical[2 * pair + 1] == kBlocked) return;
         for (int side = 0; side < 2; ++side) {
             const std::int64_t row = critical[2 * pair + side];
             if (row < 0) continue;

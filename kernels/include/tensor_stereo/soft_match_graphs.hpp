@@ -32,7 +32,7 @@ struct SoftMatchGraphs {
 
 // The graphs of two point sets over the same segments, and all pairs whose soft adjacency counts: the edges of both exact
 // graphs, for each edge with critical points on both sides that pair if it crosses the edge, and the chords of co-circular
-// polygons. Arguments as those of delaunay_graph. Same bits for any num_threads.
+// polygons with at most 16 corners. Arguments as those of delaunay_graph. Same bits for any num_threads.
 SoftMatchGraphs soft_match_graphs(const double* points0, const double* points1, std::int64_t num_points,
                                   const std::int64_t* index, const std::int64_t* ptr, std::int64_t num_segments,
                                   double tie_tolerance, Reach reach, int num_threads);

@@ -71,9 +71,37 @@ def accuracy(suite: Suite) -> None:
                 suite.note(title, auc=float(auc), specificity_at_96=float(specificity))
 
 
+def jumps(suite: Suite, num_flips: int = 200) -> None:
+    """How far scores jump where the graph of view 0 changes while one of 64 points moves on a straight way."""
+    found = []
+    for seed in range(num_flips):
+        left, right = (torch.from_numpy(view) for view in matched_points("float", 64, seed))
+        ptr, row = torch.tensor([0, 64]), seed % 64
+        way = torch.tensor([np.cos(seed), np.sin(seed)]) * 40
+
+        def at(share: float, left=left, right=right, ptr=ptr, row=row, way=way) -> tuple[list[int], torch.Tensor]:
+            moved = left.clone()
+            moved[row] += share * way
+            edges = ts.build_graphs(moved, ptr, tie_tolerance=0).col_indices.tolist()
+            return edges, ts.DelaunayFilter(tie_tolerance=0)(ts.Matches(moved, right, ptr)).score
+
+        low, high = 0.0, 1.0
+        if at(low)[0] == at(high)[0]:
+            continue
+        start = at(low)[0]
+        while high - low > 1e-13:
+            middle = (low + high) / 2
+            low, high = (middle, high) if at(middle)[0] == start else (low, middle)
+        found.append(float((at(high)[1] - at(low)[1]).abs().max()))
+    median, most = np.percentile(found, [50, 95])
+    title = "largest jump of a score where an edge of the graph changes, 64 points"
+    suite.note(title, flips=len(found), median=float(median), percentile_95=float(most), largest=max(found))
+
+
 def main() -> None:
     suite = Suite("soft")
     times(suite)
+    jumps(suite)
     if suite.options.data is not None:
         accuracy(suite)
     suite.write()

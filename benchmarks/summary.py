@@ -15,7 +15,8 @@ def records(suite: str) -> list[dict]:
 
 def print_comparisons(*suites: str) -> None:
     """One row per peer of every comparison."""
-    print("| task | ours | peer | time of the peer / ours, median [quartiles] |\n|---|---|---|---|")
+    print("| task | ours, a pair, point or match | peer | time of the peer / ours, median [quartiles] |")
+    print("|---|---|---|---|")
     ours: dict = {}
     for record in (r for suite in suites for r in records(suite)):
         if "case" not in record:

@@ -197,32 +197,18 @@ Index CriticalPoints::first_of_polygon(Index h, Index first) const {
     return first;
 }
 
-double CriticalPoints::reach(Index i, Index j) const noexcept {
-    const double dx = mesh_->points[j].x - mesh_->points[i].x, dy = mesh_->points[j].y - mesh_->points[i].y;
-    return reach_.edge_lengths + reach_.px / std::sqrt(dx * dx + dy * dy);
-}
-
 // Whether the dual of {i, j} may be too negative, always computed from the vertex that comes first in the input.
 bool CriticalPoints::is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept {
     if (mesh_->vertex[i] > mesh_->vertex[j]) return is_out_of_reach(j, i, left, right);
     const double limit = reach(i, j);
-    return !std::isinf(limit) && !(least_end(i, j, left) + least_end(i, j, right) >= -limit);
-}
-
-// An end less what rounding may have added to it.
-double CriticalPoints::least_end(Index i, Index j, Index k) const noexcept {
     const Point* const p = mesh_->points.data();
-    const double value = dual_end(p[i], p[j], p[k]);
-    return value - dual_end_error(p[i], p[j], p[k], value);
+    return !std::isinf(limit) &&
+           !(least_dual_end(p[i], p[j], p[left]) + least_dual_end(p[i], p[j], p[right]) >= -limit);
 }
 
 bool CriticalPoints::is_before(Index v, Index w) const noexcept {
     const Point p = mesh_->points[v], q = mesh_->points[w];
     return p.x < q.x || (p.x == q.x && p.y < q.y);
-}
-
-int CriticalPoints::turn(Index a, Index b, Index c) const noexcept {
-    return orientation(mesh_->points[a], mesh_->points[b], mesh_->points[c], mesh_->bounds);
 }
 
 }  // namespace tensor_stereo

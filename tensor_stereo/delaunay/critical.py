@@ -146,10 +146,10 @@ def limit_reach(points: Float, pairs: Int, critical: Int, *, edge_lengths: float
     with np.errstate(all="ignore"):
         for k in critical[between].T:
             x, y = (points[k] - i).T
-            cross = np.abs(dx * y - dy * x)
-            end = (x * (x - dx) + y * (y - dy)) / (2 * cross)
+            scale = 0.5 / np.abs(dx * y - dy * x)
+            end = (x * (x - dx) + y * (y - dy)) * scale
             size, span = np.abs(x) + np.abs(y), np.abs(dx) + np.abs(dy)
-            least.append(end - 1e-15 * (size * (size + (1 + 2 * np.abs(end)) * span)) / cross)
+            least.append(end - 2e-15 * (size * (size + (1 + 2 * np.abs(end)) * span)) * scale)
         limit = edge_lengths + px / np.sqrt(dx * dx + dy * dy)
         far = np.isfinite(limit) & ~(least[1] + least[0] >= -limit)
     result = critical.copy()

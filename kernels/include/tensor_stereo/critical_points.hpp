@@ -24,11 +24,12 @@ inline double dual_end(Point i, Point j, Point k) noexcept {
     return (x * (x - dx) + y * (y - dy)) / (2 * std::fabs(dx * y - dy * x));
 }
 
-// A bound on the rounding of an end with that value.
-inline double dual_end_error(Point i, Point j, Point k, double value) noexcept {
+// Such an end less what rounding may have added to it; this too every back end evaluates alike.
+inline double least_dual_end(Point i, Point j, Point k) noexcept {
     const double dx = j.x - i.x, dy = j.y - i.y, x = k.x - i.x, y = k.y - i.y;
+    const double scale = 0.5 / std::fabs(dx * y - dy * x), value = (x * (x - dx) + y * (y - dy)) * scale;
     const double size = std::fabs(x) + std::fabs(y), span = std::fabs(dx) + std::fabs(dy);
-    return 1e-15 * (size * (size + (1 + 2 * std::fabs(value)) * span)) / std::fabs(dx * y - dy * x);
+    return value - 2e-15 * (size * (size + (1 + 2 * std::fabs(value)) * span)) * scale;
 }
 
 // Of all points on one side of the line from i to j, the one that sees the segment under the largest angle: the circle
@@ -101,11 +102,18 @@ class CriticalPoints {
     void add(Chain& chain, Index i, Index j, Index vertex, Index beyond, const End& end) const;
     Index first_of_best(Index i, Index j, const Chain& chain) const;
     Index first_of_polygon(Index h, Index first) const;
-    double reach(Index i, Index j) const noexcept;
     bool is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept;
-    double least_end(Index i, Index j, Index k) const noexcept;
     bool is_before(Index v, Index w) const noexcept;
-    int turn(Index a, Index b, Index c) const noexcept;
+
+    int turn(Index a, Index b, Index c) const noexcept {
+        return orientation(mesh_->points[a], mesh_->points[b], mesh_->points[c], mesh_->bounds);
+    }
+
+    double reach(Index i, Index j) const noexcept {
+        if (reach_.px == 0) return reach_.edge_lengths;
+        const double dx = mesh_->points[j].x - mesh_->points[i].x, dy = mesh_->points[j].y - mesh_->points[i].y;
+        return reach_.edge_lengths + reach_.px / std::sqrt(dx * dx + dy * dy);
+    }
 
     Reach reach_;
     const Triangulation* mesh_ = nullptr;

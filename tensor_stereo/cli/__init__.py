@@ -8,12 +8,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Classify, tyro.conf.subcommand("classify")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Index, tyro.conf.subcommand("index")]
 )
 
 

@@ -59,3 +59,15 @@ class Evaluate:
     out: Path | None = None
     """Folder for summary.json, settings.json, the tables and one figure per scene and detector."""
     config: Annotated[EvaluationConfig, Flat] = field(default_factory=EvaluationConfig)
+
+
+@dataclass(frozen=True)
+class Index:
+    """List the pairs of folders and CSV files in one Parquet table, the manifest."""
+
+    roots: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders with stereo releases, or CSV files with the columns image0 and image1."""
+    out: Path = Path("manifest.parquet")
+    """Parquet file to write."""
+    gt_scale: float | None = None
+    """Stored value / px of disparity, where the folder layout does not tell it."""

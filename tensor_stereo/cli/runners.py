@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 
@@ -9,9 +10,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index
 from tensor_stereo.configs import EvaluationConfig
-from tensor_stereo.datasets import PairDataset, find_pairs
+from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
 from tensor_stereo.datasets.synthetic import SyntheticDataset
 from tensor_stereo.evaluation import PairEvaluation, evaluate_dataset
 from tensor_stereo.reports.evaluation import write_evaluation
@@ -19,7 +20,7 @@ from tensor_stereo.reports.matches import classify_files
 from tensor_stereo.reports.tables import Table, to_markdown
 
 
-def run(command: Demo | Classify | Evaluate) -> None:
+def run(command: Demo | Classify | Evaluate | Index) -> None:
     """Dispatch a parsed command."""
     match command:
         case Demo():
@@ -28,6 +29,8 @@ def run(command: Demo | Classify | Evaluate) -> None:
             _run_classify(command)
         case Evaluate():
             _run_evaluate(command)
+        case Index():
+            _run_index(command)
 
 
 def _run_demo(command: Demo) -> None:
@@ -49,6 +52,14 @@ def _run_evaluate(command: Evaluate) -> None:
     source = {"root": str(command.root), "scenes": [f"{pair.dataset}/{pair.scene}" for pair in files]}
     tables = write_evaluation(_progress(PairDataset(files), config), config, source=source, out=command.out)
     _print_tables(tables)
+
+
+def _run_index(command: Index) -> None:
+    manifest = build_manifest(command.roots, gt_scale=command.gt_scale)
+    write_manifest(manifest, command.out)
+    for dataset, count in sorted(Counter(manifest["dataset"]).items()):
+        print(f"{dataset}: {count} pairs")
+    print(f"{len(manifest)} pairs in {command.out}")
 
 
 def _run_classify(command: Classify) -> None:

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from .images import read_image as read_image
     from .images import read_occlusion_mask as read_occlusion_mask
     from .kitti import find_kitti as find_kitti
+    from .manifest import build_manifest as build_manifest
+    from .manifest import read_manifest as read_manifest
+    from .manifest import write_manifest as write_manifest
     from .middlebury import find_middlebury as find_middlebury
     from .pairs import PairDataset as PairDataset
     from .pairs import read_pair as read_pair
@@ -28,6 +31,7 @@ _MODULES = {
     "PairDataset": "pairs",
     "PairFiles": "files",
     "SyntheticDataset": "synthetic",
+    "build_manifest": "manifest",
     "find_eth3d": "eth3d",
     "find_kitti": "kitti",
     "find_middlebury": "middlebury",
@@ -35,10 +39,12 @@ _MODULES = {
     "read_calibration": "calibration",
     "read_disparity_png": "images",
     "read_image": "images",
+    "read_manifest": "manifest",
     "read_occlusion_mask": "images",
     "read_pair": "pairs",
     "read_pfm": "pfm",
     "render_pair": "synthetic",
+    "write_manifest": "manifest",
     "write_pfm": "pfm",
 }
 

@@ -146,3 +146,21 @@ def test_demo_prints_the_five_tables(capsys: pytest.CaptureFixture) -> None:
     main(["demo", "--num-pairs", "1"])
     printed = capsys.readouterr().out
     assert all(f"Table {k}" in printed for k in range(1, 6))
+
+
+def test_index_writes_a_manifest_of_folders_and_lists(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from tensor_stereo.datasets import read_manifest
+
+    (tmp_path / "mine.csv").write_text(f"image0,image1\n{scene / 'im1.png'},{scene / 'im0.png'}\n")
+    out = tmp_path / "m.parquet"
+    main(["index", str(scene.parent), str(tmp_path / "mine.csv"), "--out", str(out)])
+    assert "2 pairs in" in capsys.readouterr().out
+    assert {(pair.dataset, pair.scene) for pair in read_manifest(out)} == {
+        ("middlebury-2014", "rendered"),
+        ("mine", "im1"),
+    }
+    with pytest.raises(SystemExit) as stop:
+        main(["index", str(tmp_path / "none"), "--out", str(out)])
+    assert stop.value.code == 2

@@ -1,0 +1,195 @@
+"""Manifests: tables of pairs, found once and read by every sweep. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import polars as pl
+
+from .discovery import find_pairs
+from .files import PairFiles, StrPath, check_gt_scale
+from .image_size import image_size
+
+_PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration")
+SCHEMA = {
+    "dataset": pl.String,  # release, e.g. middlebury-2005
+    "scene": pl.String,  # unique within its dataset
+    **dict.fromkeys(_PATHS, pl.String),  # absolute paths; null where the release has no such file
+    "gt_scale": pl.Float64,  # stored value / gt_scale = disparity in px; null without ground truth
+    "width_px": pl.Int32,  # of image0
+    "height_px": pl.Int32,
+}
+_REQUIRED = ("dataset", "scene", "image0", "image1", "width_px", "height_px")
+_LISTED = ("image0", "image1")  # what a CSV of paths must have
+
+
+def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -> pl.DataFrame:
+    r"""Find the pairs of folders and lists of paths; only headers of images are read.
+
+    A list is a CSV file with the columns ``image0`` and ``image1`` and any of ``disparity_gt``, ``gt_scale``,
+    ``disparity_noc_gt``, ``mask``, ``calibration``, ``dataset`` (default: the file's name) and ``scene`` (default: the
+    name of ``image0`` without ending). Its paths are absolute or relative to its own folder.
+
+    Args:
+        roots: folders as :func:`~tensor_stereo.datasets.find_pairs` takes them, and ``.csv`` files. A pair that lies
+            below several of them is taken once.
+        gt_scale: as in :func:`~tensor_stereo.datasets.find_pairs`, for the folders.
+
+    Returns:
+        One row per pair with the columns of ``SCHEMA``, sorted by (dataset, scene without case).
+
+    Raises:
+        FileNotFoundError, NotADirectoryError: if a root or a listed file is missing.
+        ValueError: if there is no root, a list is wrong (naming file, row and column), two different pairs share
+            dataset and scene, or as :func:`~tensor_stereo.datasets.find_pairs`.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as root:
+    ...     for name in ("a.ppm", "b.ppm"):
+    ...         _ = Path(root, name).write_bytes(b"P6 64 48 255 ")
+    ...     _ = Path(root, "mine.csv").write_text("image0,image1\na.ppm,b.ppm\n")
+    ...     build_manifest([f"{root}/mine.csv"]).select("dataset", "scene", "width_px", "height_px").rows()
+    [('mine', 'a', 64, 48)]
+    """
+    if isinstance(roots, (str, os.PathLike)):
+        raise TypeError(f"roots must be a sequence of paths, got the single path {os.fspath(roots)!r}")
+    if not roots:
+        raise ValueError("roots must name at least one folder or CSV file")
+    found: dict[tuple[Path, Path], PairFiles] = {}
+    for root in map(Path, roots):
+        is_list = root.suffix.casefold() == ".csv" and not root.is_dir()
+        for pair in _read_list(root) if is_list else find_pairs(root, gt_scale=gt_scale):
+            found.setdefault((pair.image0.resolve(), pair.image1.resolve()), pair)
+    pairs = sorted(found.values(), key=lambda pair: (pair.dataset, pair.scene.casefold()))
+    _check_names(pairs)
+    rows = []
+    for pair in pairs:
+        width, height = image_size(pair.image0)
+        paths = {name: getattr(pair, name) for name in _PATHS}
+        rows.append(
+            {
+                "dataset": pair.dataset,
+                "scene": pair.scene,
+                **{name: None if path is None else str(path.resolve()) for name, path in paths.items()},
+                "gt_scale": pair.gt_scale,
+                "width_px": width,
+                "height_px": height,
+            }
+        )
+    return pl.DataFrame(rows, schema=SCHEMA)
+
+
+def write_manifest(manifest: pl.DataFrame, path: StrPath) -> None:
+    """Write a manifest as Parquet, in one step: there is the whole file or none.
+
+    Raises:
+        ValueError: if ``path`` does not end in ``.parquet``.
+        OSError: if it cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".parquet":
+        raise ValueError(f"a manifest ends in .parquet, got {path}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        manifest.write_parquet(part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read_manifest(path: StrPath) -> list[PairFiles]:
+    """Read a manifest and check every entry; no image is opened.
+
+    Args:
+        path: Parquet file as :func:`write_manifest` writes it; further columns are ignored.
+
+    Returns:
+        The pairs in the order of its rows.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no Parquet file, or an entry is wrong; the message names file, row (from 0) and column.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no manifest {path}")
+    try:
+        table = pl.read_parquet(path)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise ValueError(f"{path} is no readable Parquet file: {error}") from error
+    for name, dtype in SCHEMA.items():
+        if name not in table.columns:
+            raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
+        if table[name].dtype not in (dtype, pl.Null):
+            raise ValueError(f"{path}: column {name!r} must be {dtype}, got {table[name].dtype}")
+    pairs = [_to_pair(path, row, values) for row, values in enumerate(table.select(list(SCHEMA)).iter_rows(named=True))]
+    _check_names(pairs)
+    return pairs
+
+
+def _to_pair(path: Path, row: int, values: dict[str, object]) -> PairFiles:
+    """One checked row."""
+    for name in _REQUIRED:
+        if values[name] is None or values[name] == "":
+            raise ValueError(f"{path}, row {row}: column {name!r} is empty")
+    for name in ("width_px", "height_px"):
+        if not int(str(values[name])) > 0:
+            raise ValueError(f"{path}, row {row}: column {name!r} must be positive, got {values[name]}")
+    scale = values["gt_scale"]
+    if scale is not None and not (isinstance(scale, float) and 0 < scale < math.inf):
+        raise ValueError(f"{path}, row {row}: column 'gt_scale' must be positive and finite, got {scale}")
+    paths = {name: None if values[name] is None else Path(str(values[name])) for name in _PATHS}
+    for name, file in paths.items():
+        if file is not None and not file.is_file():
+            raise ValueError(f"{path}, row {row}: column {name!r} names {file}, which is no file")
+    return PairFiles(str(values["dataset"]), str(values["scene"]), gt_scale=scale, **paths)  # type: ignore[arg-type]
+
+
+def _read_list(path: Path) -> list[PairFiles]:
+    """The pairs of a CSV of paths."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no list of pairs {path}")
+    try:
+        table = pl.read_csv(path, infer_schema=False)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise ValueError(f"{path} is no readable CSV file: {error}") from error
+    for name in _LISTED:
+        if name not in table.columns:
+            raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
+    unknown = sorted(set(table.columns) - set(SCHEMA))
+    if unknown:
+        raise ValueError(f"{path} has the unknown column {unknown[0]!r}; known are {list(SCHEMA)}")
+    pairs = []
+    for row, values in enumerate(table.iter_rows(named=True)):
+        for name in _LISTED:
+            if not values[name]:
+                raise ValueError(f"{path}, row {row}: column {name!r} is empty")
+        paths = {name: path.parent / values[name] for name in _PATHS if values.get(name)}
+        for name, file in paths.items():
+            if not file.is_file():
+                raise FileNotFoundError(f"{path}, row {row}: column {name!r} names {file}, which is no file")
+        try:
+            scale = float(values["gt_scale"]) if values.get("gt_scale") else None
+            check_gt_scale(scale)
+        except ValueError as error:
+            raise ValueError(f"{path}, row {row}: column 'gt_scale': {error}") from error
+        disparity = paths.get("disparity_gt")
+        if disparity is not None and scale is None and disparity.suffix.casefold() != ".pfm":
+            raise ValueError(f"{path}, row {row}: column 'gt_scale' is empty, but {disparity} is no PFM file")
+        dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
+        pairs.append(PairFiles(dataset, scene, gt_scale=scale, **paths))
+    return pairs
+
+
+def _check_names(pairs: Sequence[PairFiles]) -> None:
+    """Raise if two pairs have one name."""
+    named: dict[tuple[str, str], PairFiles] = {}
+    for pair in pairs:
+        other = named.setdefault((pair.dataset, pair.scene), pair)
+        if other is not pair:
+            name = f"{pair.dataset}/{pair.scene}"
+            raise ValueError(f"two pairs are named {name}: {other.image0} and {pair.image0}; give them other names")

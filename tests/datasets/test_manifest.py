@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from tensor_stereo.datasets import find_pairs
+from tensor_stereo.datasets.manifest import SCHEMA, build_manifest, read_manifest, write_manifest
+
+
+def _scene(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for name in ("view1.ppm", "view5.ppm", "disp1.pgm"):
+        (folder / name).write_bytes(b"P6 64 48 255 ")
+
+
+def _list(folder: Path, text: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("a.ppm", "b.ppm", "c.ppm", "d.pgm"):
+        (folder / name).write_bytes(b"P6 7 5 255 ")
+    path = folder / "mine.csv"
+    path.write_text(text)
+    return path
+
+
+def test_a_manifest_holds_what_find_pairs_finds(tmp_path: Path) -> None:
+    for name in ("Books", "Art"):
+        _scene(tmp_path / "2005" / name)
+    manifest = build_manifest([tmp_path])
+    assert dict(manifest.schema) == SCHEMA
+    assert manifest["width_px"].to_list() == [64, 64]
+    write_manifest(manifest, tmp_path / "out" / "m.parquet")
+    assert read_manifest(tmp_path / "out" / "m.parquet") == find_pairs(tmp_path)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["m.parquet"]
+
+
+def test_pairs_below_several_roots_count_once(tmp_path: Path) -> None:
+    _scene(tmp_path / "2005" / "Art")
+    one = build_manifest([tmp_path])
+    assert build_manifest([tmp_path, tmp_path / "2005", tmp_path / "2005" / "Art"]).equals(one)
+
+
+def test_real_folders_survive_the_round_trip(data_root: Path, tmp_path: Path) -> None:
+    write_manifest(build_manifest([data_root]), tmp_path / "m.parquet")
+    assert read_manifest(tmp_path / "m.parquet") == find_pairs(data_root.resolve())
+
+
+def test_a_list_names_pairs_relative_to_its_folder(tmp_path: Path) -> None:
+    path = _list(tmp_path / "x", "image0,image1,disparity_gt,gt_scale,scene\na.ppm,b.ppm,d.pgm,4,one\nb.ppm,c.ppm,,,\n")
+    first, second = build_manifest([path]).rows(named=True)
+    assert first["dataset"] == second["dataset"] == "mine"
+    by_scene = {row["scene"]: row for row in (first, second)}
+    assert by_scene["one"]["gt_scale"] == 4.0
+    assert by_scene["one"]["disparity_gt"] == str(tmp_path / "x" / "d.pgm")
+    assert by_scene["b"]["disparity_gt"] is None
+    assert by_scene["b"]["height_px"] == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("image0\na.ppm\n", ValueError, "no column 'image1'"),
+        ("image0,image1\na.ppm,\n", ValueError, "row 0: column 'image1' is empty"),
+        ("image0,image1\na.ppm,b.ppm\na.ppm,z.ppm\n", FileNotFoundError, "row 1: column 'image1'"),
+        ("image0,image1,left\na.ppm,b.ppm,1\n", ValueError, "unknown column 'left'"),
+        ("image0,image1,gt_scale\na.ppm,b.ppm,-1\n", ValueError, "row 0: column 'gt_scale'"),
+        ("image0,image1,gt_scale\na.ppm,b.ppm,x\n", ValueError, "row 0: column 'gt_scale'"),
+        ("image0,image1,disparity_gt\na.ppm,b.ppm,d.pgm\n", ValueError, "column 'gt_scale' is empty"),
+        ("image0,image1\na.ppm,b.ppm\na.ppm,c.ppm\n", ValueError, "two pairs are named mine/a"),
+    ],
+)
+def test_a_wrong_list_names_file_row_and_column(
+    tmp_path: Path, text: str, error: type[Exception], message: str
+) -> None:
+    path = _list(tmp_path, text)
+    with pytest.raises(error, match=message) as caught:
+        build_manifest([path])
+    assert "mine" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("image0", "/no/such/file.png", "row 1: column 'image0' names /no/such/file.png"),
+        ("scene", None, "row 1: column 'scene' is empty"),
+        ("gt_scale", -3.0, "row 1: column 'gt_scale' must be positive"),
+        ("width_px", 0, "row 1: column 'width_px' must be positive"),
+        ("dataset", "middlebury-2005", None),
+    ],
+)
+def test_a_wrong_manifest_names_file_row_and_column(
+    tmp_path: Path, column: str, value: object, message: str | None
+) -> None:
+    for name in ("Art", "Books"):
+        _scene(tmp_path / "2005" / name)
+    manifest = build_manifest([tmp_path])
+    values = manifest[column].to_list()
+    values[1] = value
+    path = tmp_path / "m.parquet"
+    write_manifest(manifest.with_columns(pl.Series(column, values, dtype=SCHEMA[column])), path)
+    if message is None:
+        assert len(read_manifest(path)) == 2
+        return
+    with pytest.raises(ValueError, match=message) as caught:
+        read_manifest(path)
+    assert str(path) in str(caught.value)
+
+
+def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty.parquet").touch()
+    pl.DataFrame({"image0": [1]}).write_parquet(tmp_path / "other.parquet")
+    with pytest.raises(FileNotFoundError, match="no manifest"):
+        read_manifest(tmp_path / "none.parquet")
+    with pytest.raises(ValueError, match="no readable Parquet"):
+        read_manifest(tmp_path / "empty.parquet")
+    with pytest.raises(ValueError, match="no column 'dataset'"):
+        read_manifest(tmp_path / "other.parquet")
+    with pytest.raises(ValueError, match=r"ends in \.parquet"):
+        write_manifest(pl.DataFrame(schema=SCHEMA), tmp_path / "m.csv")
+    with pytest.raises(ValueError, match="at least one"):
+        build_manifest([])
+    with pytest.raises(TypeError, match="sequence of paths"):
+        build_manifest(str(tmp_path))  # type: ignore[arg-type]

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .pairs import read_pair as read_pair
     from .pfm import read_pfm as read_pfm
     from .pfm import write_pfm as write_pfm
+    from .sceneflow import find_sceneflow as find_sceneflow
     from .synthetic import SyntheticDataset as SyntheticDataset
     from .synthetic import render_pair as render_pair
 
@@ -36,6 +37,7 @@ _MODULES = {
     "find_kitti": "kitti",
     "find_middlebury": "middlebury",
     "find_pairs": "discovery",
+    "find_sceneflow": "sceneflow",
     "read_calibration": "calibration",
     "read_disparity_png": "images",
     "read_image": "images",

@@ -11,6 +11,7 @@ from .eth3d import eth3d_pairs
 from .files import PairFiles, StrPath, check_gt_scale, collect_pairs, missing_scale
 from .kitti import kitti_pairs
 from .middlebury import middlebury_pairs
+from .sceneflow import sceneflow_pairs
 
 _EXPECTED = """\
   Middlebury 2001, 2003:     SCENE/im2, im6, disp2 (png, ppm or pgm)
@@ -18,7 +19,8 @@ _EXPECTED = """\
   Middlebury 2014, 2021:     SCENE/im0.png, im1.png, disp0.pfm
   MiddEval3, ETH3D two-view: SCENE/im0.png, im1.png, disp0GT.pfm
   KITTI 2012:                training/colored_0, colored_1 (or image_0, image_1), disp_occ/*_10.png
-  KITTI 2015:                training/image_2, image_3, disp_occ_0/*_10.png"""
+  KITTI 2015:                training/image_2, image_3, disp_occ_0/*_10.png
+  Scene Flow:                frames_cleanpass, frames_finalpass/**/left, right/*.png, disparity/**/left/*.pfm"""
 
 
 def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: float | None = None) -> list[PairFiles]:
@@ -54,7 +56,7 @@ def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: 
     [('middlebury-2005', 'Art', 3.0)]
     """
     check_gt_scale(gt_scale)
-    pairs = collect_pairs(root, [middlebury_pairs, kitti_pairs, eth3d_pairs])
+    pairs = collect_pairs(root, [middlebury_pairs, kitti_pairs, eth3d_pairs, sceneflow_pairs])
     if not pairs:
         raise ValueError(f"no stereo pairs in {root} or below; looked for these layouts:\n{_EXPECTED}")
     pairs = _tell_apart(pairs, Path(root))

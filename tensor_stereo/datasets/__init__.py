@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .pfm import read_pfm as read_pfm
     from .pfm import write_pfm as write_pfm
     from .sceneflow import find_sceneflow as find_sceneflow
+    from .sintel import find_sintel as find_sintel
     from .synthetic import SyntheticDataset as SyntheticDataset
     from .synthetic import render_pair as render_pair
 
@@ -38,6 +39,7 @@ _MODULES = {
     "find_middlebury": "middlebury",
     "find_pairs": "discovery",
     "find_sceneflow": "sceneflow",
+    "find_sintel": "sintel",
     "read_calibration": "calibration",
     "read_disparity_png": "images",
     "read_image": "images",

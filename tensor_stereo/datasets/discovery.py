@@ -12,6 +12,7 @@ from .files import PairFiles, StrPath, check_gt_scale, collect_pairs, missing_sc
 from .kitti import kitti_pairs
 from .middlebury import middlebury_pairs
 from .sceneflow import sceneflow_pairs
+from .sintel import sintel_pairs
 
 _EXPECTED = """\
   Middlebury 2001, 2003:     SCENE/im2, im6, disp2 (png, ppm or pgm)
@@ -20,7 +21,8 @@ _EXPECTED = """\
   MiddEval3, ETH3D two-view: SCENE/im0.png, im1.png, disp0GT.pfm
   KITTI 2012:                training/colored_0, colored_1 (or image_0, image_1), disp_occ/*_10.png
   KITTI 2015:                training/image_2, image_3, disp_occ_0/*_10.png
-  Scene Flow:                frames_cleanpass, frames_finalpass/**/left, right/*.png, disparity/**/left/*.pfm"""
+  Scene Flow:                frames_cleanpass, frames_finalpass/**/left, right/*.png, disparity/**/left/*.pfm
+  Sintel stereo:             training/clean_left, clean_right, final_left, final_right, disparities/*/frame_*.png"""
 
 
 def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: float | None = None) -> list[PairFiles]:
@@ -56,7 +58,7 @@ def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: 
     [('middlebury-2005', 'Art', 3.0)]
     """
     check_gt_scale(gt_scale)
-    pairs = collect_pairs(root, [middlebury_pairs, kitti_pairs, eth3d_pairs, sceneflow_pairs])
+    pairs = collect_pairs(root, [middlebury_pairs, kitti_pairs, eth3d_pairs, sceneflow_pairs, sintel_pairs])
     if not pairs:
         raise ValueError(f"no stereo pairs in {root} or below; looked for these layouts:\n{_EXPECTED}")
     pairs = _tell_apart(pairs, Path(root))
@@ -98,4 +100,4 @@ def _select(pairs: Sequence[PairFiles], scenes: Iterable[str]) -> list[PairFiles
 
 def _has_release_scale(pair: PairFiles) -> bool:
     is_map = pair.disparity_gt is not None and pair.disparity_gt.suffix != ".pfm"
-    return is_map and not pair.dataset.startswith("kitti")
+    return is_map and not pair.dataset.startswith(("kitti", "sintel"))

@@ -110,6 +110,43 @@ def read_occlusion_mask(path: StrPath) -> NDArray[np.bool_]:
     return occluded
 
 
+def read_sintel_disparity(path: StrPath) -> NDArray[np.float32]:
+    """Read a disparity map of Sintel stereo: 4 R + G / 64 px in an 8-bit RGB image, off by at most 1/64 px; known everywhere.
+
+    Returns:
+        (H, W) float32 in px.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is empty, damaged, or no 8-bit colour image.
+    """
+    pixels = _decode(path)
+    if pixels.ndim != 3 or pixels.dtype != np.uint8:
+        raise ValueError(f"{path} must be an 8-bit RGB image, got {pixels.dtype} of shape {pixels.shape}")
+    red, green = pixels[..., 2].astype(np.float32), pixels[..., 1].astype(np.float32)  # decoded as BGR
+    return (4 * red + green / 64).astype(np.float32)
+
+
+def read_sintel_occlusion(path: StrPath) -> NDArray[np.bool_]:
+    """Read which pixels of Sintel's view 0 view 1 does not see: occluded ones, and those out of its frame if that map lies beside.
+
+    Returns:
+        (H, W) bool.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if a map is empty, damaged or of several channels, or both differ in size.
+    """
+    path = Path(path)
+    beside = path.parents[2] / "outofframe" / path.parent.name / path.name
+    maps = [_decode(file) for file in (path, beside) if file == path or file.is_file()]
+    for file, values in zip((path, beside), maps, strict=False):
+        if values.shape != maps[0].shape or values.ndim != 2:
+            raise ValueError(f"{file} must be a map (H, W) of one channel, got shape {values.shape}")
+    hidden: NDArray[np.bool_] = np.any([values != 0 for values in maps], axis=0)
+    return hidden
+
+
 def _decode_grey(path: StrPath) -> NDArray[Any]:
     """(H, W) stored values of a one-channel image."""
     pixels = _decode(path)

@@ -16,8 +16,15 @@ from torch.utils.data import Dataset
 from tensor_stereo.types import StereoPair
 
 from .files import PairFiles, check_gt_scale, missing_scale
-from .images import read_disparity_png, read_image, read_occlusion_mask
+from .images import (
+    read_disparity_png,
+    read_image,
+    read_occlusion_mask,
+    read_sintel_disparity,
+    read_sintel_occlusion,
+)
 from .pfm import FloatMap, read_pfm
+from .sintel import DATASET as SINTEL
 
 
 def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
@@ -98,6 +105,8 @@ class PairDataset(Dataset[StereoPair]):
 def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> FloatMap:
     """(H, W) float32 in px, NaN where unknown."""
     scale = files.gt_scale if gt_scale is None else gt_scale
+    if files.dataset.startswith(SINTEL):
+        return read_sintel_disparity(path)
     if path.suffix != ".pfm":
         if scale is None:
             raise missing_scale(files)
@@ -112,6 +121,8 @@ def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> Flo
 
 def _read_occluded(files: PairFiles, disparity: FloatMap, gt_scale: float | None) -> NDArray[np.bool_] | None:
     """(H, W) bool from whatever the release tells of occlusion, None if it is silent."""
+    if files.mask is not None and files.dataset.startswith(SINTEL):
+        return read_sintel_occlusion(files.mask)
     if files.mask is not None:
         return read_occlusion_mask(files.mask)
     if files.disparity_noc_gt is None:

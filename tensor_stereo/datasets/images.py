@@ -111,7 +111,7 @@ def read_occlusion_mask(path: StrPath) -> NDArray[np.bool_]:
 
 
 def read_sintel_disparity(path: StrPath) -> NDArray[np.float32]:
-    """Read a disparity map of Sintel stereo: 4 R + G / 64 px in an 8-bit RGB image, off by at most 1/64 px; known everywhere.
+    """Read a disparity map of Sintel stereo: 4 R + G / 64 px in an 8-bit RGB image, known everywhere to 1/64 px.
 
     Returns:
         (H, W) float32 in px.
@@ -128,7 +128,7 @@ def read_sintel_disparity(path: StrPath) -> NDArray[np.float32]:
 
 
 def read_sintel_occlusion(path: StrPath) -> NDArray[np.bool_]:
-    """Read which pixels of Sintel's view 0 view 1 does not see: occluded ones, and those out of its frame if that map lies beside.
+    """Read what Sintel's view 1 does not see: occluded pixels, and those out of its frame if that map lies beside.
 
     Returns:
         (H, W) bool.

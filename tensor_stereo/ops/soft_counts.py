@@ -40,8 +40,9 @@ def soft_counts_backward(
         >>> points, ptr = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.0, 2.0]]).double(), torch.tensor([0, 1])
         >>> pairs, critical, edge = torch.tensor([[0, 1]]), torch.tensor([[-1, 2]]), torch.tensor([True])
         >>> views = (points, points, pairs, critical, critical, edge, edge, ptr, torch.ones(()).double())
-        >>> soft_counts_backward(*views, 40.0, False, 1.0, torch.ones(3, 3).double())[0].shape
-        torch.Size([3, 2])
+        >>> if kernels is not None:
+        ...     of_points0, _, _ = soft_counts_backward(*views, 40.0, False, 1.0, torch.ones(3, 3).double())
+        ...     assert of_points0.shape == (3, 2)
     """
     resolve_backend("native")
     arrays = _arrays(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, pair_ptr, gradient)
@@ -110,8 +111,8 @@ def soft_counts(
         >>> points, ptr = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.0, 1.0]]).double(), torch.tensor([0, 1])
         >>> pairs, critical, edge = torch.tensor([[0, 1]]), torch.tensor([[-1, 2]]), torch.tensor([True])
         >>> views = (points, points, pairs, critical, critical, edge, edge, ptr, torch.ones(()).double())
-        >>> soft_counts(*views, 40.0, False, 100.0)[:, 0] if "native" == resolve_backend("auto") else "needs kernels"
-        tensor([1., 1., 0.], dtype=torch.float64)
+        >>> if kernels is not None:
+        ...     assert soft_counts(*views, 40.0, False, 100.0)[:, 0].tolist() == [1.0, 1.0, 0.0]
     """
     resolve_backend("native")
     arrays = _arrays(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, pair_ptr)

@@ -38,11 +38,21 @@ using Doubles = Input<double, nb::ndim<1>>;
 template <class T>
 using Output = nb::ndarray<nb::numpy, T, nb::ndim<1>>;
 
+// What frees an array that NumPy holds.
+nb::capsule owner_of(void* data) {
+    return nb::capsule(data, [](void* memory) noexcept { ts::Free()(memory); });
+}
+
 template <class T>
 Output<T> give(ts::Buffer<T> values, std::size_t size) {
     T* const data = values.release();
-    nb::capsule owner(data, [](void* memory) noexcept { ts::Free()(memory); });
-    return Output<T>(data, {size}, owner);
+    return Output<T>(data, {size}, owner_of(data));
+}
+
+template <std::size_t kColumns, class T>
+auto give_rows(ts::Buffer<T> values, std::size_t rows) {
+    T* const data = values.release();
+    return nb::ndarray<nb::numpy, T, nb::shape<-1, kColumns>>(data, {rows, kColumns}, owner_of(data));
 }
 
 void check(bool condition, const char* message) {
@@ -53,13 +63,6 @@ void check_offsets(const Integers& ptr, std::int64_t total, const char* message)
     const std::size_t size = ptr.shape(0);
     check(size >= 1 && ptr.data()[0] == 0 && ptr.data()[size - 1] == total, message);
     for (std::size_t k = 1; k < size; ++k) check(ptr.data()[k - 1] <= ptr.data()[k], message);
-}
-
-template <std::size_t kColumns, class T>
-auto give_rows(ts::Buffer<T> values, std::size_t rows) {
-    T* const data = values.release();
-    nb::capsule owner(data, [](void* memory) noexcept { ts::Free()(memory); });
-    return nb::ndarray<nb::numpy, T, nb::shape<-1, kColumns>>(data, {rows, kColumns}, owner);
 }
 
 auto give_pattern(ts::SparsePattern graph) {
@@ -114,14 +117,14 @@ auto dual_critical_points(Points points, Integers index, Integers ptr, Pairs pai
     const std::size_t num_pairs = pairs.shape(0);
     check(pair_ptr.shape(0) == ptr.shape(0), "pair_ptr and ptr must have the same length");
     check_offsets(pair_ptr, static_cast<std::int64_t>(num_pairs), "pair_ptr must rise from 0 to the length of pairs");
-    ts::CriticalPairs found;
+    ts::Buffer<std::int64_t> found;
     {
         const nb::gil_scoped_release release;
         found = ts::dual_critical_points(points.data(), index.data(), ptr.data(),
                                          static_cast<std::int64_t>(ptr.shape(0)) - 1, pairs.data(), pair_ptr.data(),
                                          num_threads);
     }
-    return give_rows<2>(std::move(found.critical), num_pairs);
+    return give_rows<2>(std::move(found), num_pairs);
 }
 
 void check_rows(const Pairs& rows, std::int64_t lowest, std::int64_t num_points, const char* message) {

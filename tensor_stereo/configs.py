@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Literal
+from typing import Literal, get_args
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
 TemperatureUnit = Literal["edge", "px"]
 Backend = Literal["auto", "native", "scipy"]
 
+RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
 DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4
 
 

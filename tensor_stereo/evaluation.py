@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import polars as pl
 import torch
 from torch import Tensor
 
-from tensor_stereo.configs import ClassifyConfig, Detector, EvaluationConfig, Restriction
+from tensor_stereo.configs import RESTRICTIONS, ClassifyConfig, Detector, EvaluationConfig, Restriction
 from tensor_stereo.filters import classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.metrics import Confusion, IsolatedCounts, confusion_update, isolated_update, matches_against_gt
@@ -19,7 +19,6 @@ from tensor_stereo.pipeline import Stopwatch, group_pairs, match_pairs, to_gray_
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
 VARIANTS = ("unconstrained", "constrained")
-RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
 
 
 @dataclass(frozen=True, eq=False)

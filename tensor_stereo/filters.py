@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tensor_stereo import ops
 from tensor_stereo.batching import select_matches
-from tensor_stereo.configs import Backend, Restriction
+from tensor_stereo.configs import RESTRICTIONS, Backend, Restriction
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.types import Classification, Matches
@@ -70,14 +70,22 @@ def classify_graphs(
         >>> classify_graphs(graphs, min_group_size=3).relation
         tensor([1, 1, 1], dtype=torch.int8)
     """
-    if min_group_size < 1:
-        raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
-    accept_subsets = {"adjacency": False, "cardinality": True}.get(restriction)
-    if accept_subsets is None:
-        raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
+    check_verdict(restriction, min_group_size)
+    accept_subsets = restriction == "cardinality"
     overlap, degree0, degree1 = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=backend)
     relation, inlier = ops.relate(overlap, degree0, degree1, graphs.group_size, min_group_size, accept_subsets, backend)
     return Classification(inlier, relation, overlap, degree0, degree1)
+
+
+def check_verdict(restriction: str, min_group_size: int) -> None:
+    """Raise unless these are options of :func:`classify_matches`.
+
+    >>> check_verdict("cardinality", 4)
+    """
+    if min_group_size < 1:
+        raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
+    if restriction not in RESTRICTIONS:
+        raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded
 from tensor_stereo.configs import Backend, Restriction, TemperatureUnit
-from tensor_stereo.filters import FilterOutput, classify_graphs
-from tensor_stereo.ops import resolve_backend
+from tensor_stereo.filters import FilterOutput, check_verdict, classify_graphs
+from tensor_stereo.ops.segments import check_options
 from tensor_stereo.soft import (
     COLDEST,
     HOTTEST,
@@ -20,10 +20,9 @@ from tensor_stereo.soft import (
     count_soft_neighbors,
     soft_jaccard,
 )
-from tensor_stereo.types import Classification, Matches, Relation
+from tensor_stereo.types import Classification, Matches, Relation, check_unit
 
 UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
-RESTRICTIONS: tuple[Restriction, ...] = ("adjacency", "cardinality")
 
 
 class DelaunayFilter(nn.Module):
@@ -72,20 +71,14 @@ class DelaunayFilter(nn.Module):
         backend: Backend = "auto",
     ) -> None:
         super().__init__()
-        if restriction not in RESTRICTIONS:
-            raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
+        check_verdict(restriction, min_group_size)
         if score != "topology":
             raise ValueError(f"score must be 'topology', got {score!r}")
-        if unit not in ("edge", "px"):
-            raise ValueError(f"unit must be 'edge' or 'px', got {unit!r}")
+        check_unit(unit)
         check_temperature(temperature)
-        if not 0 <= tie_tolerance < 1:
-            raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
+        check_options(tie_tolerance, backend)
         if threshold is not None and not 0 <= threshold <= 1:
             raise ValueError(f"threshold must lie in [0, 1] or be None, got {threshold}")
-        resolve_backend(backend)
-        if min_group_size < 1:
-            raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
         self.restriction = restriction
         self.score = score
         self.unit = unit

@@ -17,7 +17,7 @@ from torch.autograd import forward_ad
 from tensor_stereo import ops
 from tensor_stereo.configs import Backend, TemperatureUnit
 from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.types import Adjacency, Matches, check_pairs, check_points
+from tensor_stereo.types import Adjacency, Matches, check_pairs, check_points, check_tie_tolerance, check_unit
 
 SATURATION = 40.0  # |length / temperature| beyond which an adjacency is constant
 REACH = 16.0  # temperatures of negative length below which a pair counts as blocked; its adjacency is below 1.2e-7
@@ -87,7 +87,7 @@ def build_soft_graphs(
         >>> build_soft_graphs(Matches(corners, corners, torch.tensor([0, 4]))).pairs.shape
         torch.Size([6, 2])
     """
-    _check_unit(unit)
+    check_unit(unit)
     like = matches.keypoints0
     reach = REACH * _to_temperature(temperature, like.device).detach()
     none = torch.zeros_like(reach)
@@ -225,7 +225,7 @@ def soft_adjacency(
         >>> soft_adjacency(points, torch.tensor([[0, 1]]), tie)
         tensor([0.5000], dtype=torch.float64)
     """
-    _check_unit(unit)
+    check_unit(unit)
     points = _to_float64("keypoints", keypoints)
     check_pairs("pairs", pairs, len(points))
     length = _ratio(points, pairs, geometry.critical, pair_ptr, tie_tolerance, backend)
@@ -294,7 +294,7 @@ def count_soft_neighbors(
         >>> count_soft_neighbors(matches, build_soft_graphs(matches)).intersection > 2  # and half of a diagonal
         tensor([True, True, True, True])
     """
-    _check_unit(unit)
+    check_unit(unit)
     views = (("keypoints0", matches.keypoints0, found.view0), ("keypoints1", matches.keypoints1, found.view1))
     if ops.resolve_backend(backend) == "scipy":
         adjacency0, adjacency1 = (
@@ -368,8 +368,7 @@ def _ratio(
 
 def _bound(tie_tolerance: float) -> float:
     """Edge lengths to which the ends of dual edges are clipped."""
-    if not 0 <= tie_tolerance < 1:
-        raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
+    check_tie_tolerance(tie_tolerance)
     return 1 / tie_tolerance if tie_tolerance > 0 else _UNBOUNDED
 
 
@@ -397,8 +396,3 @@ def check_temperature(temperature: float) -> None:
     """
     if not COLDEST <= temperature <= HOTTEST:
         raise ValueError(f"temperature must lie in [{COLDEST:g}, {HOTTEST:g}], got {temperature}")
-
-
-def _check_unit(unit: str) -> None:
-    if unit not in ("edge", "px"):
-        raise ValueError(f"unit must be 'edge' or 'px', got {unit!r}")

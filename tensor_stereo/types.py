@@ -252,3 +252,15 @@ def check_pairs(name: str, pairs: Tensor, num_rows: int) -> None:
         raise ValueError(f"{name} must be (E, 2) int64, got {tuple(pairs.shape)} {pairs.dtype}")
     if not torch.compiler.is_compiling() and len(pairs) and not (pairs.min() >= 0 and pairs.max() < num_rows):
         raise ValueError(f"{name} must name rows 0..{num_rows - 1}, got {int(pairs.min())}..{int(pairs.max())}")
+
+
+def check_tie_tolerance(tie_tolerance: float) -> None:
+    """Raise unless 0 <= ``tie_tolerance`` < 1."""
+    if not 0 <= tie_tolerance < 1:
+        raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
+
+
+def check_unit(unit: str) -> None:
+    """Raise unless ``unit`` is one that a temperature can have."""
+    if unit not in ("edge", "px"):
+        raise ValueError(f"unit must be 'edge' or 'px', got {unit!r}")

@@ -4,6 +4,7 @@
 #include <cstdlib>
 
 namespace tensor_stereo {
+
 void CriticalPoints::prepare(const Triangulation& mesh, const GraphEdges& edges) {
     mesh_ = &mesh;
     edges_ = &edges;
@@ -59,7 +60,7 @@ bool CriticalPoints::across(Index h, Critical& found) const noexcept {
         if (inside == 0) return false;
     }
     found = {mesh_->vertex[j], mesh_->vertex[i], false};
-    if (is_out_of_reach(k, l, j, i)) found = {kBlocked, kBlocked, false};
+    if (is_out_of_reach(k, l, j, i)) found = kBlockedPair;
     return true;
 }
 
@@ -71,20 +72,19 @@ Critical CriticalPoints::find_in_mesh(Index i, Index j) {
         const Point r = mesh_->points[v];
         return p.x == q.x ? (r.y > p.y) == (q.y > p.y) : (r.x > p.x) == (q.x > p.x);
     };
-    constexpr Critical kIsBlocked{kBlocked, kBlocked, false};
     const Index first = fan_[i], first_end = origin[next_in_triangle(first)];
     int right = turn(i, first_end, j);
     if (right == 0 && first_end == j) return in_reach(first, of_half_edge(first));
-    if (right == 0 && is_ahead(first_end)) return kIsBlocked;
+    if (right == 0 && is_ahead(first_end)) return kBlockedPair;
     for (Index h = first;;) {
         const Index back = previous_in_triangle(h), end = origin[back];
         const int left = turn(i, end, j);
         if (left == 0 && end == j) return in_reach(back, of_half_edge(back)).reversed();
-        if (left == 0 && is_ahead(end)) return kIsBlocked;
+        if (left == 0 && is_ahead(end)) return kBlockedPair;
         if (right > 0 && left < 0) return to_input(walk(i, j, h));
         right = left;
         h = twin[back];
-        if (h == kNone) return kIsBlocked;  // not in a triangulation
+        if (h == kNone) return kBlockedPair;  // not in a triangulation
     }
 }
 
@@ -122,7 +122,7 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
     left_.start(first_left, twin[previous_in_triangle(h)], look(first_left));
     h = twin[next_in_triangle(h)];
     while (true) {  // the segment enters a triangle through h, which runs from the left chain to the right one
-        if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return {kBlocked, kBlocked, false};
+        if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return kBlockedPair;
         const Index to_left = previous_in_triangle(h), to_right = next_in_triangle(h);
         const Index apex = origin[to_left];
         if (apex == j) {
@@ -133,7 +133,7 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
         const End apex_end = look(apex);
         int side = sign(cross);
         if (std::fabs(cross) <= mesh_->bounds.orientation) side = turn(i, j, apex);
-        if (side == 0) return {kBlocked, kBlocked, false};
+        if (side == 0) return kBlockedPair;
         if (side > 0) {
             add(left_, i, j, apex, twin[to_left], apex_end);
             h = twin[to_right];
@@ -143,7 +143,7 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
         }
     }
     const Critical found{first_of_best(j, i, right_), first_of_best(i, j, left_), false};
-    return is_out_of_reach(i, j, found.right, found.left) ? Critical{kBlocked, kBlocked, false} : found;
+    return is_out_of_reach(i, j, found.right, found.left) ? kBlockedPair : found;
 }
 
 // Appends to the left or the right chain; rounding decides nothing.

@@ -197,11 +197,11 @@ SoftMatchGraphs soft_match_graphs(const double* points0, const double* points1, 
     return result;
 }
 
-CriticalPairs dual_critical_points(const double* points, const std::int64_t* index, const std::int64_t* ptr,
-                                   std::int64_t num_segments, const std::int64_t* pairs, const std::int64_t* pair_ptr,
-                                   int num_threads) {
+Buffer<std::int64_t> dual_critical_points(const double* points, const std::int64_t* index, const std::int64_t* ptr,
+                                          std::int64_t num_segments, const std::int64_t* pairs,
+                                          const std::int64_t* pair_ptr, int num_threads) {
     constexpr double kInfinity = std::numeric_limits<double>::infinity();
-    CriticalPairs result{allocate<std::int64_t>(2 * pair_ptr[num_segments]), allocate<bool>(pair_ptr[num_segments])};
+    auto result = allocate<std::int64_t>(2 * pair_ptr[num_segments]);
     parallel_for(num_segments, 1, num_threads, [&] {
         return [&, graph = SegmentGraph(points, 0), critical = CriticalPoints({kInfinity, 0}), degree = std::vector<Index>(),
                 neighbors = std::vector<Index>()](std::int64_t begin, std::int64_t end) mutable {
@@ -218,9 +218,8 @@ CriticalPairs dual_critical_points(const double* points, const std::int64_t* ind
                 };
                 for (std::int64_t k = pair_ptr[s]; k < pair_ptr[s + 1]; ++k) {
                     const Critical found = critical.find(number(pairs[2 * k]), number(pairs[2 * k + 1]));
-                    result.critical[2 * k] = to_row(members, found.right);
-                    result.critical[2 * k + 1] = to_row(members, found.left);
-                    result.is_edge[k] = found.is_edge;
+                    result[2 * k] = to_row(members, found.right);
+                    result[2 * k + 1] = to_row(members, found.left);
                 }
             }
         };

@@ -59,8 +59,7 @@ def _mesh_pairs(points: Float, mesh: Mesh) -> list[Int]:
         for members in np.split(mesh.triangles[order], np.flatnonzero(np.diff(polygon[order])) + 1):
             vertices = np.unique(members)
             if len(members) > 1 and len(vertices) <= MOST_CORNERS:
-                found.append(np.stack(np.triu_indices(len(vertices), 1), 1))
-                found[-1] = vertices[found[-1]]
+                found.append(vertices[np.stack(np.triu_indices(len(vertices), 1), 1)])
     return found
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from tensor_stereo.configs import Backend
 from tensor_stereo.duplicates import coincident_ids, keep_one_to_one
 from tensor_stereo.ops.backends import kernels, resolve_backend
-from tensor_stereo.types import check_integer, check_points, check_ptr, check_vector
+from tensor_stereo.types import check_integer, check_points, check_ptr, check_tie_tolerance, check_vector
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -34,8 +34,7 @@ def segments_of(ptr: Tensor, group: Tensor, num_rows: int) -> Int:
 
 def check_options(tie_tolerance: float, backend: str) -> Backend:
     """The back end that shall run; raises for unknown options."""
-    if not 0 <= tie_tolerance < 1:
-        raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
+    check_tie_tolerance(tie_tolerance)
     return resolve_backend(backend)  # type: ignore[arg-type]
 
 

@@ -41,6 +41,8 @@ struct Critical {
     Critical reversed() const noexcept { return {left, right, is_edge}; }
 };
 
+inline constexpr Critical kBlockedPair{kBlocked, kBlocked, false};
+
 // Finds them for pairs of points of one segment. If {i, j} is an edge of the mesh they are its opposite vertices;
 // otherwise they are among the vertices of the triangles that the segment from i to j crosses, since the constrained
 // Delaunay triangulation with that segment only changes these (Anglada, Computers & Graphics 21 (1997), section 3).

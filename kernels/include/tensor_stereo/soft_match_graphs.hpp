@@ -16,11 +16,11 @@ struct CriticalPairs {
     Buffer<bool> is_edge;           // (num_pairs) in the graph of that view
 };
 
-// Critical points of given pairs of rows: pairs pair_ptr[s] to pair_ptr[s + 1] of vertices of segment s; edges of the exact
-// graph, without reach.
-CriticalPairs dual_critical_points(const double* points, const std::int64_t* index, const std::int64_t* ptr,
-                                   std::int64_t num_segments, const std::int64_t* pairs, const std::int64_t* pair_ptr,
-                                   int num_threads);
+// Critical points (num_pairs, 2) of given pairs of rows, as in CriticalPairs but without reach: pairs pair_ptr[s] to
+// pair_ptr[s + 1] are vertices of segment s.
+Buffer<std::int64_t> dual_critical_points(const double* points, const std::int64_t* index, const std::int64_t* ptr,
+                                          std::int64_t num_segments, const std::int64_t* pairs,
+                                          const std::int64_t* pair_ptr, int num_threads);
 
 struct SoftMatchGraphs {
     SparsePattern graph[2];

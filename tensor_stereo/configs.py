@@ -8,6 +8,7 @@ from typing import Literal, get_args
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
 TemperatureUnit = Literal["edge", "px"]
+ScoreName = Literal["none", "topology"]
 Backend = Literal["auto", "native", "scipy"]
 
 RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
@@ -106,6 +107,42 @@ class PipelineConfig(StepConfigs):
 
 
 @dataclass(frozen=True)
+class TrialConfig(PipelineConfig):
+    """One point of a sweep's grid: a pipeline, what is done to its putative matches, and how they are scored."""
+
+    outlier_rate: float = 0.0  # fraction of the matches whose partners in view 1 change places among them
+    noise_px: float = 0.0  # standard deviation added to x and y of both keypoints
+    seed: int = 0  # of outliers and noise, together with the name of the pair
+    score: ScoreName = "topology"  # none: no score, and no curve in the results
+    temperature: float = 1.0  # of the score
+    temperature_unit: TemperatureUnit = "edge"
+    threshold: float | None = None  # verdict by score >= threshold instead of by restriction
+    max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.outlier_rate <= 1:
+            raise ValueError(f"outlier_rate must lie in [0, 1], got {self.outlier_rate}")
+        if not 0 <= self.noise_px < float("inf"):
+            raise ValueError(f"noise_px must be finite and not negative, got {self.noise_px}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+        if self.score == "none" and self.threshold is not None:
+            raise ValueError(f"threshold must be None where score is 'none', got {self.threshold}")
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """The points of a grid, each of which every pair goes through."""
+
+    trials: tuple[TrialConfig, ...] = (TrialConfig(),)
+    export_matches: bool = False  # whether every match with its verdict is kept, for training
+
+    def __post_init__(self) -> None:
+        if not self.trials:
+            raise ValueError("trials must hold at least one point")
+
+
+@dataclass(frozen=True)
 class EvaluationConfig(StepConfigs):
     """From pairs with ground truth to the paper's tables; ``restriction`` is the one that the tables show."""
 
@@ -113,10 +150,19 @@ class EvaluationConfig(StepConfigs):
     detectors: tuple[Detector, ...] = DETECTORS
     max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more
 
-    def pipeline(self, detector: Detector, *, constrained: bool = False) -> PipelineConfig:
-        """The same settings for one detector."""
-        shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)}
-        return PipelineConfig(**shared, detector=detector, constrained=constrained)
+    def trials(self, detector: Detector) -> tuple[TrialConfig, ...]:
+        """The same settings for one detector: without and with Restriction 3, under both restrictions."""
+        shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)} | {"detector": detector}
+        return tuple(
+            TrialConfig(
+                **shared | {"restriction": restriction},
+                constrained=constrained,
+                score="none",
+                max_error_px=self.max_error_px,
+            )
+            for constrained in (False, True)
+            for restriction in RESTRICTIONS
+        )
 
 
 @dataclass(frozen=True)

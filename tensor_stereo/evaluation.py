@@ -1,4 +1,4 @@
-"""Dataset x settings -> verdicts against ground truth, as the paper evaluates them."""
+"""Dataset x settings -> verdicts against ground truth."""
 
 from __future__ import annotations
 
@@ -8,69 +8,81 @@ from typing import Any
 
 import polars as pl
 import torch
-from torch import Tensor
 
-from tensor_stereo.configs import RESTRICTIONS, ClassifyConfig, Detector, EvaluationConfig, Restriction
-from tensor_stereo.filters import classify_graphs
-from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.metrics import Confusion, IsolatedCounts, confusion_update, isolated_update, matches_against_gt
+from tensor_stereo.configs import Detector, EvaluationConfig, SweepConfig
+from tensor_stereo.metrics import IsolatedCounts, isolated_update
 from tensor_stereo.objects import isolated_matches
-from tensor_stereo.pipeline import Stopwatch, group_pairs, match_pairs, to_gray_pairs
-from tensor_stereo.types import Classification, Matches, Relation, StereoPair
+from tensor_stereo.trials import STAGES, Trial, TrialRunner
+from tensor_stereo.types import StereoPair
 
-VARIANTS = ("unconstrained", "constrained")
-
-
-@dataclass(frozen=True, eq=False)
-class VariantEvaluation:
-    """One pair, one detector, with or without Restriction 3.
-
-    Attributes:
-        variant: ``unconstrained`` or ``constrained``.
-        matches: the putative matches, with ``group`` if constrained.
-        graphs: their Delaunay graphs.
-        verdicts: one classification per restriction.
-        seconds: wall time by stage.
-    """
-
-    variant: str
-    matches: Matches
-    graphs: MatchGraphs
-    verdicts: dict[Restriction, Classification]
-    seconds: dict[str, float]
+ROW_SCHEMA: dict[str, Any] = {
+    "trial": pl.Int32,  # number of the setting in the configuration
+    "dataset": pl.String,
+    "scene": pl.String,
+    "detector": pl.String,
+    "feature_backend": pl.String,  # null where the detector has one implementation
+    "window_px": pl.Int32,  # null where descriptors are no image windows
+    "max_ratio": pl.Float64,  # null: no ratio test; so for every gate
+    "mutual": pl.Boolean,
+    "max_row_offset_px": pl.Float64,
+    "min_disparity_px": pl.Float64,
+    "max_disparity_px": pl.Float64,
+    "variant": pl.String,  # unconstrained, or constrained: Restriction 3
+    "restriction": pl.String,
+    "min_group_size": pl.Int32,
+    "tie_tolerance": pl.Float64,
+    "outlier_rate": pl.Float64,
+    "noise_px": pl.Float64,
+    "seed": pl.Int64,
+    "score": pl.String,
+    "temperature": pl.Float64,  # null without score
+    "temperature_unit": pl.String,
+    "threshold": pl.Float64,  # null: the verdict is that of the restriction
+    "num_matches": pl.Int64,
+    "num_valid": pl.Int64,  # ground truth is known
+    "num_untested": pl.Int64,  # among all matches
+    "true_positive": pl.Int64,  # incorrect and rejected
+    "false_positive": pl.Int64,  # correct and rejected
+    "true_negative": pl.Int64,  # correct and kept
+    "false_negative": pl.Int64,  # incorrect and kept
+    "fraction_incorrect": pl.Float64,  # of the valid ones; NaN where undefined, so for every rate
+    "sensitivity": pl.Float64,  # incorrect matches rejected
+    "specificity": pl.Float64,  # correct matches kept
+    "ppv": pl.Float64,
+    "npv": pl.Float64,
+    "auc": pl.Float64,  # of the score; null without score, so for the next three
+    "specificity_at_sensitivity_96": pl.Float64,
+    "score_counts_correct": pl.List(pl.Int64),  # 128 equal bins of [0, 1]; they add up over pairs
+    "score_counts_incorrect": pl.List(pl.Int64),
+    "seconds": pl.Struct(dict.fromkeys(STAGES, pl.Float64)),  # wall time by stage, also where it was shared
+}
 
 
 @dataclass(frozen=True, eq=False)
 class PairEvaluation:
-    """One pair, one detector: both variants, both restrictions.
+    """One pair, one detector, without and with Restriction 3, under both restrictions.
 
     Attributes:
         pair: the images and their ground truth.
         detector: the detector of both views.
-        correct: (M,) bool, the disparity is right.
-        valid: (M,) bool, ground truth is known.
-        variants: unconstrained and constrained.
+        trials: one result per variant and restriction, the constrained ones last.
     """
 
     pair: StereoPair
     detector: Detector
-    correct: Tensor
-    valid: Tensor
-    variants: tuple[VariantEvaluation, ...]
+    trials: tuple[Trial, ...]
 
     def isolated(self) -> IsolatedCounts:
         """How many correct and incorrect matches join two objects that no other match joins."""
-        constrained = self.variants[-1].matches
-        if constrained.group is None:
-            raise ValueError("variants must end with the constrained one, whose matches have a group")
-        alone = isolated_matches(constrained.group, constrained.ptr)
-        return isolated_update(alone, self.correct, self.valid)
+        last = self.trials[-1]
+        if last.matches.group is None:
+            raise ValueError("trials must end with a constrained one, whose matches have a group")
+        alone = isolated_matches(last.matches.group, last.matches.ptr)
+        return isolated_update(alone, last.correct, last.valid)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One record per variant and restriction, as :func:`score_dataset` documents them."""
-        return [
-            _row(self, variant, restriction) for variant in self.variants for restriction in variant.verdicts
-        ]  # fmt: skip
+        """One record per trial, as :func:`score_dataset` documents them, under the full name of the pair."""
+        return [trial.row() | {"scene": self.pair.name} for trial in self.trials]
 
 
 def evaluate_dataset(
@@ -107,32 +119,26 @@ def evaluate_pair(
     Raises:
         ValueError: if the pair has no ground truth.
     """
-    if pair.disparity_gt is None:
-        raise ValueError(f"disparity_gt of {pair.name!r} is missing; an evaluation needs ground truth")
-    settings = config.pipeline(detector)
-    watch = Stopwatch()
-    gray = to_gray_pairs([(pair.image0, pair.image1)])
-    matches = match_pairs(gray, settings, watch)
-    correct, valid = matches_against_gt(matches, [pair.disparity_gt], max_error_px=config.max_error_px)
-    shared = dict(watch.seconds)
-    plain = _evaluate_variant("unconstrained", matches, Stopwatch(dict(shared)), settings)
-    watch = Stopwatch(dict(shared))
-    constrained = _evaluate_variant("constrained", group_pairs(gray, matches, settings, watch), watch, settings)
-    return PairEvaluation(pair, detector, correct, valid, (plain, constrained))
+    check_truth(pair)
+    runner = TrialRunner(pair)
+    return PairEvaluation(pair, detector, tuple(runner.run(trial) for trial in config.trials(detector)))
 
 
-def score_dataset(dataset: Iterable[StereoPair], config: EvaluationConfig = EvaluationConfig()) -> pl.DataFrame:
+def score_dataset(
+    dataset: Iterable[StereoPair], config: SweepConfig | EvaluationConfig = EvaluationConfig()
+) -> pl.DataFrame:
     """Score every pair of a dataset, as one table.
 
     Args:
         dataset: pairs with ``disparity_gt``.
-        config: settings of every step.
+        config: the points of a sweep, as :func:`tensor_stereo.sweeps.read_grid` makes them, or the settings of the
+            paper's tables: every detector without and with Restriction 3, under both restrictions.
 
     Returns:
-        One row per scene, detector, variant and restriction: ``num_matches``, ``num_valid`` (ground truth known),
-        ``num_untested`` (among all matches), ``fraction_incorrect`` (of the valid ones), ``sensitivity`` (incorrect
-        matches rejected), ``specificity`` (correct matches kept), ``ppv``, ``npv``, and the struct ``seconds`` of wall
-        time by stage. Rates with an empty denominator are NaN.
+        One row per pair and point, in this order, with the columns of ``ROW_SCHEMA``: the settings; ``num_matches``,
+        ``num_valid``, ``num_untested``; the counts and rates of the verdict (positive: estimated incorrectly); area
+        under the ROC curve and binned counts of the score, if there is one; and ``seconds`` by stage. A sweep over the
+        same pairs stores the same rows.
 
     Raises:
         ValueError: for a pair without ground truth.
@@ -145,38 +151,19 @@ def score_dataset(dataset: Iterable[StereoPair], config: EvaluationConfig = Eval
         >>> table.select("detector", "variant", "restriction").rows()[-1]
         ('fast', 'constrained', 'cardinality')
     """
-    return pl.DataFrame([row for result in evaluate_dataset(dataset, config) for row in result.rows()])
+    if isinstance(config, SweepConfig):
+        trials = config.trials
+    else:
+        trials = tuple(trial for detector in config.detectors for trial in config.trials(detector))
+    rows = []
+    for pair in dataset:
+        check_truth(pair)
+        runner = TrialRunner(pair)
+        rows += [{"trial": k} | runner.run(trial).row() for k, trial in enumerate(trials)]
+    return pl.DataFrame(rows, schema=ROW_SCHEMA)
 
 
-def _evaluate_variant(variant: str, matches: Matches, watch: Stopwatch, options: ClassifyConfig) -> VariantEvaluation:
-    with watch.measure("graph"):
-        graphs = build_match_graphs(matches, tie_tolerance=options.tie_tolerance, backend=options.backend)
-    verdicts: dict[Restriction, Classification] = {}
-    for restriction in RESTRICTIONS:
-        relate = Stopwatch(dict(watch.seconds))
-        with relate.measure("relate"):
-            verdicts[restriction] = classify_graphs(
-                graphs, restriction=restriction, min_group_size=options.min_group_size
-            )
-    return VariantEvaluation(variant, matches, graphs, verdicts, relate.seconds)
-
-
-def _row(result: PairEvaluation, variant: VariantEvaluation, restriction: Restriction) -> dict[str, Any]:
-    verdict = variant.verdicts[restriction]
-    confusion: Confusion = confusion_update(verdict.inlier, result.correct, result.valid)
-    rates = confusion.rates()
-    return {
-        "scene": result.pair.name,
-        "detector": result.detector,
-        "variant": variant.variant,
-        "restriction": restriction,
-        "num_matches": variant.matches.num_matches,
-        "num_valid": int(result.valid.sum()),
-        "num_untested": int((verdict.relation == Relation.UNTESTED).sum()),
-        "fraction_incorrect": rates.fraction_incorrect,
-        "sensitivity": rates.sensitivity,
-        "specificity": rates.specificity,
-        "ppv": rates.ppv,
-        "npv": rates.npv,
-        "seconds": variant.seconds,
-    }
+def check_truth(pair: StereoPair) -> None:
+    """Raise if a pair has no ground truth."""
+    if pair.disparity_gt is None:
+        raise ValueError(f"disparity_gt of {pair.name!r} is missing; an evaluation needs ground truth")

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
-from tensor_stereo.configs import PipelineConfig
+from tensor_stereo.configs import MatchingConfig, PipelineConfig
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.filters import classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
@@ -106,13 +106,23 @@ def to_gray_pairs(pairs: Sequence[ImagePair]) -> list[ImagePair]:
 def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwatch) -> Matches:
     """Features of every image, then the putative matches of every pair."""
     with watch.measure("detect"):
-        found = detect_images([pair[view] for view in (0, 1) for pair in gray], config)
-        features0, features1 = (concatenate_features(part) for part in (found[: len(gray)], found[len(gray) :]))
+        features0, features1 = detect_pairs(gray, config)
     with watch.measure("match"):
-        matching = config.matching
-        if matching.max_ratio is None and config.detector == "sift":
-            matching = replace(matching, max_ratio=config.sift.max_ratio)
-        return match_features(features0, features1, matching)
+        return match_features(features0, features1, matching_settings(config))
+
+
+def detect_pairs(gray: Sequence[ImagePair], config: PipelineConfig) -> tuple[Features, Features]:
+    """Features of view 0 and of view 1 of every pair."""
+    found = detect_images([pair[view] for view in (0, 1) for pair in gray], config)
+    features0, features1 = (concatenate_features(part) for part in (found[: len(gray)], found[len(gray) :]))
+    return features0, features1
+
+
+def matching_settings(config: PipelineConfig) -> MatchingConfig:
+    """The matcher's settings, with the ratio that the detector's own settings say where the matcher's say none."""
+    if config.matching.max_ratio is None and config.detector == "sift":
+        return replace(config.matching, max_ratio=config.sift.max_ratio)
+    return config.matching
 
 
 def detect_images(images: Sequence[Tensor], config: PipelineConfig) -> list[Features]:

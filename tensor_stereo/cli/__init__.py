@@ -8,13 +8,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Sweep
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Classify, tyro.conf.subcommand("classify")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Index, tyro.conf.subcommand("index")]
+    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
 )
 
 
@@ -28,12 +29,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     from tensor_stereo.cli.runners import run  # torch is needed from here on
+    from tensor_stereo.sweeps.journal import RunInUseError
 
     try:
-        run(command)
-    except (ValueError, TypeError, OSError) as error:
+        code = run(command)
+    except (ValueError, TypeError, ImportError, RunInUseError, OSError) as error:
         print(f"tensor-stereo: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("tensor-stereo: interrupted", file=sys.stderr)
         sys.exit(130)
+    if code:
+        sys.exit(code)

@@ -71,3 +71,33 @@ class Index:
     """Parquet file to write."""
     gt_scale: float | None = None
     """Stored value / px of disparity, where the folder layout does not tell it."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Run every pair of a manifest through a grid of settings; a run that ended early goes on where it was."""
+
+    settings: tyro.conf.Positional[Path]
+    """TOML file with the grid."""
+    manifest: Path
+    """Parquet file that index wrote."""
+    out: Path
+    """Run folder."""
+    engine: Literal["local", "ray"] = "local"
+    """Processes on this machine, or a Ray cluster."""
+    workers: int | None = None
+    """Units at a time; one per core if not given."""
+    ray_address: str | None = None
+    """Of a running Ray cluster."""
+    shard: str = "1/1"
+    """i/n: the i-th of n parts of the sweep, as for an array of jobs."""
+    limit: int | None = None
+    """Units to do now, at most."""
+    retry_errors: bool = False
+    """Do failed units again."""
+    verify: bool = False
+    """Hash the finished parts instead of trusting their size."""
+    dry_run: bool = False
+    """Print what would run, and what it costs on one pair, and stop."""
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
+    """Of log.jsonl in the run folder."""

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Sweep
+from tensor_stereo.cli.sweep import run_sweep_command
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
 from tensor_stereo.datasets.synthetic import SyntheticDataset
@@ -20,8 +21,8 @@ from tensor_stereo.reports.matches import classify_files
 from tensor_stereo.reports.tables import Table, to_markdown
 
 
-def run(command: Demo | Classify | Evaluate | Index) -> None:
-    """Dispatch a parsed command."""
+def run(command: Demo | Classify | Evaluate | Index | Sweep) -> int:
+    """Dispatch a parsed command; its exit code."""
     match command:
         case Demo():
             _run_demo(command)
@@ -31,6 +32,9 @@ def run(command: Demo | Classify | Evaluate | Index) -> None:
             _run_evaluate(command)
         case Index():
             _run_index(command)
+        case Sweep():
+            return run_sweep_command(command)
+    return 0
 
 
 def _run_demo(command: Demo) -> None:

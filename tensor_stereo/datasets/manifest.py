@@ -9,6 +9,8 @@ from pathlib import Path
 
 import polars as pl
 
+from tensor_stereo.atomic import whole_file
+
 from .discovery import find_pairs
 from .files import PairFiles, StrPath, check_gt_scale
 from .image_size import image_size
@@ -93,19 +95,16 @@ def write_manifest(manifest: pl.DataFrame, path: StrPath) -> None:
     if path.suffix != ".parquet":
         raise ValueError(f"a manifest ends in .parquet, got {path}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with whole_file(path) as part:
         manifest.write_parquet(part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
-def read_manifest(path: StrPath) -> list[PairFiles]:
+def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]:
     """Read a manifest and check every entry; no image is opened.
 
     Args:
         path: Parquet file as :func:`write_manifest` writes it; further columns are ignored.
+        check_files: whether a file that is missing is an error now, or only when it is read.
 
     Returns:
         The pairs in the order of its rows.
@@ -126,12 +125,12 @@ def read_manifest(path: StrPath) -> list[PairFiles]:
             raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
         if table[name].dtype not in (dtype, pl.Null):
             raise ValueError(f"{path}: column {name!r} must be {dtype}, got {table[name].dtype}")
-    pairs = [_to_pair(path, row, values) for row, values in enumerate(table.select(list(SCHEMA)).iter_rows(named=True))]
+    pairs = [_to_pair(path, row, values, check_files) for row, values in enumerate(table.select(list(SCHEMA)).iter_rows(named=True))]
     _check_names(pairs)
     return pairs
 
 
-def _to_pair(path: Path, row: int, values: dict[str, object]) -> PairFiles:
+def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool) -> PairFiles:
     """One checked row."""
     for name in _REQUIRED:
         if values[name] is None or values[name] == "":
@@ -144,7 +143,7 @@ def _to_pair(path: Path, row: int, values: dict[str, object]) -> PairFiles:
         raise ValueError(f"{path}, row {row}: column 'gt_scale' must be positive and finite, got {scale}")
     paths = {name: None if values[name] is None else Path(str(values[name])) for name in _PATHS}
     for name, file in paths.items():
-        if file is not None and not file.is_file():
+        if check_files and file is not None and not file.is_file():
             raise ValueError(f"{path}, row {row}: column {name!r} names {file}, which is no file")
     return PairFiles(str(values["dataset"]), str(values["scene"]), gt_scale=scale, **paths)  # type: ignore[arg-type]
 

@@ -63,18 +63,18 @@ def write_evaluation(
 
 def draw_evaluation(result: PairEvaluation, config: EvaluationConfig, path: Path) -> None:
     """Draw the constrained variant of one pair and detector."""
-    constrained = result.variants[-1]
+    constrained = next(t for t in reversed(result.trials) if t.config.restriction == config.restriction)
     pair = result.pair
     contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in (pair.image0, pair.image1)]
     figure = draw_classification(
         pair.image0,
         pair.image1,
         constrained.matches,
-        constrained.verdicts[config.restriction],
+        constrained.classification,
         constrained.graphs.adjacency0,
         constrained.graphs.adjacency1,
-        correct=result.correct,
-        valid=result.valid,
+        correct=constrained.correct,
+        valid=constrained.valid,
         contours0=contours[0],
         contours1=contours[1],
         title=f"{pair.name}, {result.detector.upper()}, {config.restriction}, constrained by objects",

@@ -132,7 +132,8 @@ def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality"
         [['FAST', '10.0', '20.0', '30.0']]
     """
     records = _index_variant(rows, restriction, "constrained")
-    stages = list(dict.fromkeys(stage for record in records.values() for stage in _field(record, "seconds")))
+    spent = [item for record in records.values() for item in _field(record, "seconds").items()]
+    stages = list(dict.fromkeys(stage for stage, value in spent if value != 0))  # those that ran
     body: list[tuple[Cell, ...]] = []
     for detector in _detectors(records):
         seconds = [_field(record, "seconds") for key, record in records.items() if key[1] == detector]

@@ -1,0 +1,122 @@
+"""``tensor-stereo sweep``: progress on standard error, a summary on standard output, an exit code."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from tensor_stereo.cli.commands import Sweep
+from tensor_stereo.datasets import read_manifest
+from tensor_stereo.sweeps import SweepProgress, build_plan, read_grid, run_sweep
+from tensor_stereo.sweeps.plan import Plan
+from tensor_stereo.sweeps.run import check_trials
+from tensor_stereo.sweeps.units import run_tasks
+from tensor_stereo.trials import STAGES
+
+SOME_FAILED, INTERRUPTED = 1, 130
+_PLAIN_SECONDS = 10.0  # between lines where the output is no terminal
+
+
+def run_sweep_command(command: Sweep) -> int:
+    """Run a sweep; 0 if every unit is done, 1 if some failed, 130 if it was interrupted."""
+    config = read_grid(command.settings)
+    shard = _parse_shard(command.shard)
+    if command.dry_run:
+        print_plan(build_plan(config, read_manifest(command.manifest, check_files=False)), shard)
+        return 0
+    with _show_progress() as show:
+        summary = run_sweep(
+            config,
+            command.manifest,
+            command.out,
+            engine=command.engine,
+            num_workers=command.workers,
+            ray_address=command.ray_address,
+            shard=shard,
+            limit=command.limit,
+            retry_errors=command.retry_errors,
+            verify=command.verify,
+            log_level=command.log_level,
+            on_progress=show,
+        )
+    end = summary.progress
+    print(f"{end.num_done} of {end.num_units} units done, {end.num_new} now, {end.num_failed} failed: {command.out}")
+    if end.num_failed:
+        print(f"The reasons are in {command.out / 'errors.parquet'}; --retry-errors does them again.")
+    if summary.interrupted:
+        print("Interrupted; the same command goes on.")
+        return INTERRUPTED
+    return SOME_FAILED if end.num_failed else 0
+
+
+def print_plan(plan: Plan, shard: tuple[int, int]) -> None:
+    """Print what a sweep would run, how stages are shared, and what a unit takes, timed on one pair."""
+    units = plan.shard(*shard)
+    check_trials(plan.config)
+    num_pairs = len(units) // len(plan.groups)
+    print(f"{num_pairs} pairs x {len(plan.config.trials)} points of the grid = {len(units)} units of work")
+    if not num_pairs:
+        return
+    print("Runs of each stage in one unit (one pair, one detector setting), and seconds of one unit:")
+    widths = {"features": 8, "detector": 8, "trials": 6, **dict.fromkeys(STAGES, 7), "seconds": 8}
+    print("  ".join(f"{name:>{width}}" for name, width in widths.items()))
+    total = 0.0
+    pair = units[len(units) // 2] // len(plan.groups)
+    for number, row in enumerate(plan.costs().iter_rows(named=True)):
+        (result,) = run_tasks(plan.config, [plan.task(pair * len(plan.groups) + number)])  # warm: check_trials ran all
+        start = time.perf_counter()
+        (result,) = run_tasks(plan.config, [plan.task(pair * len(plan.groups) + number)])
+        seconds = math.nan if result.error else time.perf_counter() - start
+        total += seconds
+        print(
+            "  ".join(f"{row[name]:>{width}}" for name, width in widths.items() if name != "seconds"),
+            f"{seconds:>9.3f}",
+        )
+    files = plan.pairs[pair]
+    print(f"Timed on {files.dataset}/{files.scene}: about {_time(total * num_pairs)} for all on one worker.")
+
+
+@contextmanager
+def _show_progress() -> Iterator[Callable[[SweepProgress], None]]:
+    """A bar on a terminal, a line every ten seconds elsewhere."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        last = time.monotonic()
+
+        def print_line(state: SweepProgress) -> None:
+            nonlocal last
+            if time.monotonic() - last >= _PLAIN_SECONDS:
+                last = time.monotonic()
+                print(f"{state.num_done}/{state.num_units} units, {_rate(state)}", file=sys.stderr, flush=True)
+
+        yield print_line
+        return
+    columns = TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}")
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("sweep", total=None, rate="")
+        yield lambda state: progress.update(task, completed=state.num_done, total=state.num_units, rate=_rate(state))
+
+
+def _rate(state: SweepProgress) -> str:
+    left = "" if math.isnan(state.seconds_left) else f", {_time(state.seconds_left)} left"
+    failed = f", {state.num_failed} failed" if state.num_failed else ""
+    return f"{state.units_per_second:.1f} units/s{left}{failed}"
+
+
+def _time(seconds: float) -> str:
+    return "unknown time" if math.isnan(seconds) else str(timedelta(seconds=round(seconds)))
+
+
+def _parse_shard(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None:
+        raise ValueError(f"shard must be i/n, as 1/4, got {text!r}")
+    return int(match[1]), int(match[2])

@@ -1,0 +1,147 @@
+"""The journals of a run folder: which parts are finished, and who works on them."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+LOG = logging.getLogger(__name__)
+
+
+@dataclass
+class JournalState:
+    """What the journals of a run say.
+
+    Attributes:
+        done: units with rows or an error.
+        errors: the record of each failed unit.
+        files: size and hash of each finished part, by path relative to the run.
+    """
+
+    done: set[int] = field(default_factory=set)
+    errors: dict[int, dict[str, Any]] = field(default_factory=dict)
+    files: dict[str, tuple[int, str]] = field(default_factory=dict)
+
+
+class RunInUseError(RuntimeError):
+    """Another process works on the same run."""
+
+
+def read_journals(out: Path, *, verify: bool = False) -> JournalState:
+    """What is finished. Parts whose files are missing, or have another size or hash, count as not done.
+
+    Args:
+        out: run folder.
+        verify: read and hash the files instead of asking for their size.
+    """
+    state = JournalState()
+    for path in sorted(out.glob("journal-*.jsonl")):
+        for line in path.read_bytes().splitlines():
+            try:
+                entry = json.loads(line)
+            except ValueError:  # torn by the end of its process
+                LOG.warning("%s has a damaged line; what it lists is done again", path.name)
+                continue
+            damaged = [
+                name
+                for name, (size, sha256) in entry["files"].items()
+                if not _is_whole(out / name, size, sha256, verify)
+            ]
+            for name in damaged:
+                LOG.warning("%s is damaged; its units are done again", name)
+            if damaged:
+                entry = entry | {"files": {}, "done": []}
+            enter(entry, state)
+    return state
+
+
+def enter(entry: dict[str, Any], state: JournalState) -> None:
+    """Enter one line of a journal; what it says of a unit replaces what was said before."""
+    state.files.update(entry["files"])
+    for unit in entry["done"]:
+        state.done.add(unit)
+        state.errors.pop(unit, None)
+    for record in entry["errors"]:
+        state.done.add(record["unit"])
+        state.errors[record["unit"]] = record
+
+
+def append(entry: dict[str, Any], journal: IO[bytes]) -> None:
+    """Add a line that is on disk when this returns, or is not there.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
+    end = os.fstat(journal.fileno()).st_size
+    try:
+        if journal.write(line) != len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), journal.name)
+        os.fsync(journal.fileno())
+    except OSError:
+        journal.truncate(end)
+        raise
+
+
+@contextmanager
+def run_lock(out: Path) -> Iterator[None]:
+    """Wait for, and hold, the run folder for the moment of a change that all shards share."""
+    with (out / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def open_journal(out: Path, shard: tuple[int, int]) -> IO[bytes]:
+    """This shard's journal, locked as long as it is open, without the line that a crash has torn."""
+    for path in out.glob("journal-*.jsonl"):
+        if not path.stem.endswith(f"-of-{shard[1]}"):
+            with path.open("r+") as other:
+                _lock_journal(other, path)
+    path = out / f"journal-{shard[0]}-of-{shard[1]}.jsonl"
+    journal = path.open("ab", buffering=0)
+    try:
+        _lock_journal(journal, path)
+        data = path.read_bytes()
+        journal.truncate(data.rfind(b"\n") + 1)
+    except BaseException:
+        journal.close()
+        raise
+    return journal
+
+
+def _lock_journal(file: IO[Any], path: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RunInUseError(f"another process works on {path.parent} ({path.stem}); wait for it or stop it") from None
+
+
+def is_open_elsewhere(out: Path, shard: str) -> bool:
+    """Whether another process works on a shard, named as in ``journal-1-of-4``."""
+    path = out / f"journal-{shard}.jsonl"
+    if not path.exists():
+        return False
+    with path.open("r+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def _is_whole(path: Path, size: int, sha256: str, verify: bool) -> bool:
+    try:
+        if path.stat().st_size != size:
+            return False
+        return not verify or hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+    except FileNotFoundError:
+        return False

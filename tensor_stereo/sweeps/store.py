@@ -1,0 +1,245 @@
+"""The run folder of a sweep: parts that appear whole, and a journal of those that are finished.
+
+    RUN/config.json          the points of the grid and the fingerprint of the manifest
+    RUN/manifest.parquet     the pairs
+    RUN/environment.json     one record per start: time, host, versions, engine
+    RUN/journal-1-of-1.jsonl one line per part: its files with size and hash, the units that it holds
+    RUN/metrics/part-*.parquet   one row per unit and trial
+    RUN/matches/part-*.parquet   one row per match, if the sweep keeps them
+    RUN/errors.parquet       one row per failed unit
+    RUN/log.jsonl            what happened when
+
+A part is written to a temporary file, flushed to disk, renamed, and only then entered in the journal, which is flushed
+too. So a part counts once or not at all, whenever the process ends.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from tensor_stereo.atomic import whole_file
+from tensor_stereo.evaluation import ROW_SCHEMA
+from tensor_stereo.sweeps.journal import append, enter, is_open_elsewhere, open_journal, read_journals, run_lock
+from tensor_stereo.sweeps.units import UnitResult
+
+LOG = logging.getLogger(__name__)
+METRICS_SCHEMA: dict[str, Any] = {
+    "unit": pl.Int32,  # number of the unit in the plan
+    **ROW_SCHEMA,
+    "host": pl.String,  # of the worker
+    "attempt": pl.Int32,  # how many workers have tried the unit
+}
+ERRORS_SCHEMA: dict[str, Any] = {
+    "unit": pl.Int32,
+    "dataset": pl.String,
+    "scene": pl.String,
+    "detector": pl.String,
+    "stage": pl.String,  # read, one of the stages of a trial, or worker
+    "error": pl.String,  # name of the exception
+    "message": pl.String,
+    "attempts": pl.Int32,
+}
+MATCHES_SCHEMA: dict[str, Any] = {
+    "unit": pl.Int32,
+    "trial": pl.Int32,
+    **dict.fromkeys(("x0", "y0", "x1", "y1"), pl.Float32),  # px
+    "cost": pl.Float32,
+    "inlier": pl.Boolean,
+    "relation": pl.Int8,  # values of Relation
+    "score": pl.Float32,  # null without score
+    "correct": pl.Boolean,  # null where ground truth is unknown
+}
+
+
+class RunStore:
+    """A run folder that this process adds to; use it as a context.
+
+    Args:
+        out: the run folder, made if it is not there.
+        config: what makes the results what they are, as JSON values; another one is refused.
+        manifest: the pairs, kept beside the results.
+        shard: (i, n), the part of the sweep that this process does; every shard has a journal of its own.
+        units_per_part: units after which a part is written.
+        seconds_per_part: time after which a part is written, if there is anything to write.
+        verify: hash the finished parts instead of trusting their size.
+
+    Raises:
+        ValueError: if ``out`` holds the results of another configuration, or something else.
+        RunInUseError: if another process works on this shard, or on another division into shards.
+        OSError: if ``out`` cannot be written.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        config: dict[str, Any],
+        manifest: pl.DataFrame,
+        *,
+        shard: tuple[int, int] = (1, 1),
+        units_per_part: int = 500,
+        seconds_per_part: float = 30.0,
+        verify: bool = False,
+    ) -> None:
+        self.out = out
+        self._name = f"{shard[0]}-of-{shard[1]}"
+        self._units_per_part = units_per_part
+        self._seconds_per_part = seconds_per_part
+        self._pending: list[UnitResult] = []
+        self._flushed_at = time.monotonic()
+        out.mkdir(parents=True, exist_ok=True)
+        with run_lock(out):
+            _claim(out, config, manifest)
+            self._journal = open_journal(out, shard)
+            try:
+                self.state = read_journals(out, verify=verify)
+                self._number = 1 + max(map(_part_number, out.glob(f"*/part-{self._name}-*")), default=0)
+                _set_aside_unlisted(out, set(self.state.files), self._name)
+                self._write_errors()
+            except BaseException:
+                self._journal.close()
+                raise
+
+    def __enter__(self) -> RunStore:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        try:
+            self.flush()
+        finally:
+            self._journal.close()
+
+    def add(self, result: UnitResult) -> None:
+        """Take the result of a unit; a full or an old part is written.
+
+        Raises:
+            OSError: if the part cannot be written; its results are kept and go with the next one.
+        """
+        self._pending.append(result)
+        is_old = time.monotonic() - self._flushed_at > self._seconds_per_part
+        if is_old or len(self._pending) >= self._units_per_part:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is pending as one part and enter it in the journal."""
+        if not self._pending:
+            return
+        good = sorted((result for result in self._pending if result.error is None), key=lambda result: result.unit)
+        failed = [result for result in self._pending if result.error is not None]
+        files: dict[str, tuple[int, str]] = {}
+        if good:
+            metrics = pl.DataFrame([row for result in good for row in result.rows], METRICS_SCHEMA)
+            tables = {"metrics": metrics}
+            if good[0].matches is not None:
+                tables["matches"] = pl.concat([_match_table(result) for result in good])
+            for folder, table in tables.items():
+                path = self.out / folder / f"part-{self._name}-{self._number:06d}.parquet"
+                path.parent.mkdir(exist_ok=True)
+                files[path.relative_to(self.out).as_posix()] = _write_table(table, path)
+        errors = [{"unit": r.unit, **(r.error or {}), "attempts": r.attempt} for r in failed]
+        entry = {"files": files, "done": [result.unit for result in good], "errors": errors}
+        append(entry, self._journal)
+        enter(entry, self.state)
+        self._number += 1
+        self._pending.clear()
+        self._flushed_at = time.monotonic()
+        if errors:
+            with run_lock(self.out):
+                self._write_errors()
+
+    def _write_errors(self) -> None:
+        """The failed units of all shards, as one table."""
+        errors = sorted(read_journals(self.out).errors.values(), key=lambda record: int(record["unit"]))
+        _write_table(pl.DataFrame(errors, ERRORS_SCHEMA), self.out / "errors.parquet")
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write JSON in one step: there is the whole file, the old one, or none."""
+    with whole_file(path) as part:
+        part.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def append_environment(out: Path, record: dict[str, Any]) -> None:
+    """Add the record of one start to environment.json."""
+    path = out / "environment.json"
+    with run_lock(out):
+        records = json.loads(path.read_text()) if path.exists() else []
+        write_json([*records, record], path)
+
+
+def _write_table(table: pl.DataFrame, path: Path) -> tuple[int, str]:
+    """Write Parquet in one step; its size and hash."""
+    buffer = io.BytesIO()
+    table.write_parquet(buffer)
+    data = buffer.getvalue()
+    with whole_file(path) as part:
+        part.write_bytes(data)
+    return len(data), hashlib.sha256(data).hexdigest()
+
+
+def _match_table(result: UnitResult) -> pl.DataFrame:
+    if result.matches is None:
+        raise ValueError(f"matches of unit {result.unit} are missing")
+    columns = dict(result.matches)
+    valid = columns.pop("valid")
+    table = pl.DataFrame({"unit": np.full(len(valid), result.unit, np.int32), **columns})
+    table = table.with_columns(
+        pl.col("cost", "score").fill_nan(None), pl.when(pl.Series(valid)).then(pl.col("correct")).alias("correct")
+    )
+    return table.cast(MATCHES_SCHEMA)  # type: ignore[arg-type]
+
+
+def _claim(out: Path, config: dict[str, Any], manifest: pl.DataFrame) -> None:
+    """Make ``out`` the run of a configuration, or raise if it is that of another one."""
+    path = out / "config.json"
+    config = json.loads(json.dumps(config))
+    if path.exists():
+        known = json.loads(path.read_text())
+        if known != config:
+            change = _first_difference(known, config, "")
+            raise ValueError(f"out: {out} holds results of other settings: {change}; name another folder")
+        return
+    others = {entry.name for entry in out.iterdir()} - {".lock", "manifest.parquet"}  # these two come first
+    if others:
+        raise ValueError(f"out: {out} is no run, but holds {min(others)}; name another folder")
+    _write_table(manifest, out / "manifest.parquet")
+    write_json(config, path)
+
+
+def _first_difference(known: Any, given: Any, name: str) -> str:
+    if isinstance(known, dict) and isinstance(given, dict):
+        for key in sorted(known.keys() | given.keys()):
+            if known.get(key) != given.get(key):
+                return _first_difference(known.get(key), given.get(key), f"{name}.{key}" if name else key)
+    if isinstance(known, list) and isinstance(given, list):
+        if len(known) != len(given):
+            return f"{name} has {len(known)} entries there, {len(given)} here"
+        for k, (old, new) in enumerate(zip(known, given, strict=True)):
+            if old != new:
+                return _first_difference(old, new, f"{name}[{k}]")
+    return f"{name} is {known!r} there, {given!r} here"
+
+
+def _set_aside_unlisted(out: Path, listed: set[str], shard: str) -> None:
+    """Rename parts that no journal lists, as after a crash before the entry: their units are done again."""
+    for path in out.glob("*/*part-*"):
+        owner = path.name.split("part-", 1)[1].rsplit("-", 1)[0]
+        if path.relative_to(out).as_posix() in listed or (owner != shard and is_open_elsewhere(out, owner)):
+            continue
+        if path.name.startswith("."):
+            path.unlink()  # half a file
+        elif path.suffix == ".parquet":
+            path.rename(path.with_suffix(".parquet.unlisted"))
+            LOG.warning("%s is in no journal and was set aside", path.name)
+
+
+def _part_number(path: Path) -> int:
+    return int(path.name.split(".")[0].rsplit("-", 1)[1])

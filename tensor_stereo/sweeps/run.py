@@ -89,6 +89,8 @@ def run_sweep(
     limit: int | None = None,
     retry_errors: bool = False,
     verify: bool = False,
+    units_per_part: int = 500,
+    seconds_per_part: float = 30.0,
     log_level: str = "INFO",
     on_progress: Callable[[SweepProgress], None] | None = None,
 ) -> SweepSummary:
@@ -109,6 +111,8 @@ def run_sweep(
         limit: do no more than so many units now.
         retry_errors: do failed units again.
         verify: hash the finished parts instead of trusting their size.
+        units_per_part: units after which a part is written: what a crash costs at most, and
+        seconds_per_part: the time after which one is written in any case.
         log_level: of ``log.jsonl``.
         on_progress: called after every batch.
 
@@ -137,24 +141,46 @@ def run_sweep(
         "sweep": asdict(config),
         "manifest": {"num_pairs": len(plan.pairs), "sha256": _fingerprint(plan)},
     }
-    with RunStore(out, record, table, shard=shard, verify=verify) as store, log_to_file(out / "log.jsonl", log_level):
+    store = RunStore(
+        out,
+        record,
+        table,
+        shard=shard,
+        units_per_part=units_per_part,
+        seconds_per_part=seconds_per_part,
+        verify=verify,
+    )
+    with store, log_to_file(out / "log.jsonl", log_level):
         known = store.state.done - store.state.errors.keys() if retry_errors else store.state.done
         todo = [unit for unit in units if unit not in known]
         todo = todo if limit is None else todo[:limit]
         LOG.info("start", extra={"units": len(units), "todo": len(todo), "engine": engine, "shard": list(shard)})
         append_environment(out, _environment(engine, num_workers, shard))
-        driver = _Driver(plan, store, units, todo, on_progress)
+        workers: Engine | None = None
         if todo:
-            workers: Engine = (
-                LocalEngine(config, num_workers) if engine == "local" else RayEngine(config, num_workers, ray_address)
-            )
-            try:
-                driver.run(workers)
-            finally:
-                workers.close()
-        summary = SweepSummary(driver.progress(), driver.stopping)
-        LOG.info("end", extra={"interrupted": driver.stopping, **asdict(summary.progress)})
+            local = engine == "local"
+            workers = LocalEngine(config, num_workers) if local else RayEngine(config, num_workers, ray_address)
+        summary = drive(workers, plan, store, units, todo, on_progress)
+        LOG.info("end", extra={"interrupted": summary.interrupted, **asdict(summary.progress)})
         return summary
+
+
+def drive(
+    engine: Engine | None,
+    plan: Plan,
+    store: RunStore,
+    units: Collection[int],
+    todo: Collection[int],
+    on_progress: Callable[[SweepProgress], None] | None = None,
+) -> SweepSummary:
+    """Run the units ``todo`` among ``units`` on an engine, which is closed at the end; None: there is nothing to do."""
+    driver = _Driver(plan, store, units, todo, on_progress)
+    if engine is not None:
+        try:
+            driver.run(engine)
+        finally:
+            engine.close()
+    return SweepSummary(driver.progress(), driver.stopping)
 
 
 def check_trials(config: SweepConfig) -> None:
@@ -235,7 +261,7 @@ class _Driver:
             self._num_new += 1
             if result.error is not None:
                 self._num_failed += 1
-                LOG.error("unit failed", extra={"unit": result.unit, **result.error})
+                LOG.error("unit failed", extra={"unit": result.unit, "reason": result.error})
         if self._on_progress is not None:
             self._on_progress(self.progress())
 

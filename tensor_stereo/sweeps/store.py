@@ -147,11 +147,12 @@ class RunStore:
         errors = [{"unit": r.unit, **(r.error or {}), "attempts": r.attempt} for r in failed]
         entry = {"files": files, "done": [result.unit for result in good], "errors": errors}
         append(entry, self._journal)
+        failed_before = dict(self.state.errors)
         enter(entry, self.state)
         self._number += 1
         self._pending.clear()
         self._flushed_at = time.monotonic()
-        if errors:
+        if self.state.errors != failed_before:
             with run_lock(self.out):
                 self._write_errors()
 

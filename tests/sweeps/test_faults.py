@@ -1,0 +1,256 @@
+"""What sweeps survive. After each fault: every good unit once, the bad ones with their reason, nothing lost."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from multiprocessing import active_children
+from pathlib import Path
+
+import cv2
+import numpy as np
+import polars as pl
+import pytest
+
+from tensor_stereo.configs import SweepConfig
+from tensor_stereo.datasets import read_image, write_pfm
+from tensor_stereo.sweeps import SweepProgress, build_plan, expand_grid, read_errors, read_results, run_sweep
+from tensor_stereo.sweeps.engines import Outcome
+from tensor_stereo.sweeps.run import MAX_DEATHS, drive
+from tensor_stereo.sweeps.store import RunStore
+from tensor_stereo.sweeps.units import run_tasks
+from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, write_pairs
+
+FAST = SweepConfig(expand_grid([{"detector": "fast"}]))
+SCRIPT = """
+import os, signal, sys
+from tensor_stereo.sweeps import expand_grid, run_sweep
+from tensor_stereo.configs import SweepConfig
+from multiprocessing import active_children
+
+def fault(state):
+    {fault}
+
+if __name__ == "__main__":
+    grid = dict(detector=["fast", "gftt"], restriction=["adjacency", "cardinality"], outlier_rate=[0.0, 0.4])
+    config = SweepConfig(expand_grid([grid]))
+    summary = run_sweep(config, sys.argv[1], sys.argv[2], num_workers=2, units_per_part=1, on_progress=fault)
+    sys.exit(130 if summary.interrupted else 0)
+"""
+
+
+def _run_script(fault: str, inputs: Inputs, out: Path, **options: object) -> subprocess.Popen[str]:
+    """A sweep in a process of its own, with a fault at every report of progress."""
+    script = out.parent / "script.py"
+    script.write_text(SCRIPT.format(fault=fault))
+    command = [sys.executable, str(script), str(inputs.manifest), str(out)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
+
+
+def _ended(pid: int, timeout_ms: int = 60_000) -> bool:
+    """Whether a process that is no child ends in time."""
+    try:
+        descriptor = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    try:
+        return bool(poll.poll(timeout_ms))
+    finally:
+        os.close(descriptor)
+
+
+def test_a_killed_worker_loses_no_unit(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
+    killed = []
+
+    def kill_first(_: SweepProgress) -> None:
+        if not killed:
+            killed.append(active_children()[0].pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    summary = run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=2, on_progress=kill_first)
+    assert killed
+    assert summary.progress.num_failed == 0
+    assert_same(stored(tmp_path / "run"), expected)
+    assert "a worker died" in (tmp_path / "run" / "log.jsonl").read_text()
+
+
+@pytest.mark.slow
+def test_a_killed_driver_leaves_no_worker_and_a_run_that_goes_on(
+    inputs: Inputs, expected: pl.DataFrame, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    fault = "print(*(child.pid for child in active_children()), flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    process = _run_script(fault, inputs, out)
+    printed, _ = process.communicate(timeout=120)
+    assert process.returncode == -signal.SIGKILL
+    workers = [int(word) for word in printed.split()]
+    assert workers
+    assert all(_ended(pid) for pid in workers)
+    before = stored(out)
+    assert 0 < len(before) < len(expected)
+    summary = run_sweep(inputs.config, inputs.manifest, out, num_workers=1)
+    assert summary.progress.num_new == 12 - before["unit"].n_unique()
+    assert_same(stored(out), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_finishes_what_is_under_way(
+    inputs: Inputs, expected: pl.DataFrame, tmp_path: Path, number: signal.Signals
+) -> None:
+    out = tmp_path / "run"
+    process = _run_script(f"os.kill(os.getpid(), {int(number)}) if state.num_new < 3 else None", inputs, out)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    before = stored(out)
+    assert 0 < len(before) < len(expected)
+    run_sweep(inputs.config, inputs.manifest, out, num_workers=1)
+    assert_same(stored(out), expected)
+
+
+@pytest.mark.slow
+def test_two_processes_on_one_run(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    (tmp_path / "sweep.toml").write_text(
+        '[grid]\ndetector = ["fast", "gftt"]\nrestriction = ["adjacency", "cardinality"]\noutlier_rate = [0.0, 0.4]\n'
+    )
+    command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml"), "--out", str(out)]
+    command += ["--manifest", str(inputs.manifest)]
+    refused = []
+
+    def start_second(_: SweepProgress) -> None:
+        if not refused:
+            refused.append(subprocess.run(command, capture_output=True, text=True, check=False))
+
+    run_sweep(inputs.config, inputs.manifest, out, num_workers=1, on_progress=start_second)
+    assert refused[0].returncode == 2
+    assert "another process works on" in refused[0].stderr
+    assert_same(stored(out), expected)
+
+
+class _DeadlyEngine:
+    """Runs tasks in this process; each batch with a deadly unit dies, and takes with it all that is under way."""
+
+    num_workers = 2
+
+    def __init__(self, config: SweepConfig, deadly: set[int], *, blames_exactly: bool) -> None:
+        self.config, self.deadly, self.blames_exactly = config, deadly, blames_exactly
+        self.under_way: list[tuple] = []
+
+    def submit(self, tasks) -> None:
+        self.under_way.append(tuple(tasks))
+
+    def collect(self, timeout_seconds: float) -> list[Outcome]:
+        dies = {tasks for tasks in self.under_way if self.deadly & {task.unit for task in tasks}}
+        if dies and not self.blames_exactly:
+            dies = set(self.under_way)
+        done = self.under_way if dies and not self.blames_exactly else self.under_way[:1]
+        self.under_way = self.under_way[len(done) :]
+        return [Outcome(tasks, None if tasks in dies else run_tasks(self.config, tasks)) for tasks in done]
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("blames_exactly", [True, False])
+def test_only_the_unit_that_kills_its_worker_fails(
+    inputs: Inputs, expected: pl.DataFrame, tmp_path: Path, blames_exactly: bool
+) -> None:
+    from tensor_stereo.datasets import read_manifest
+
+    plan = build_plan(inputs.config, read_manifest(inputs.manifest))
+    engine = _DeadlyEngine(inputs.config, {3, 8}, blames_exactly=blames_exactly)
+    out = tmp_path / "run"
+    with RunStore(out, {}, pl.DataFrame({"scene": [1]})) as store:
+        summary = drive(engine, plan, store, range(plan.num_units), list(range(plan.num_units)))
+    assert summary.progress.num_done == 12
+    errors = read_errors(out)
+    assert errors["unit"].to_list() == [3, 8]
+    assert errors["error"].unique().to_list() == ["WorkerDiedError"]
+    assert (errors["attempts"] >= MAX_DEATHS).all()
+    found = stored(out)
+    deadly = [plan.task(unit) for unit in (3, 8)]
+    names = {(task.files.scene, k) for task in deadly for k in task.trials}
+    kept = expected.filter(~pl.struct("scene", "trial").map_elements(
+        lambda row: (row["scene"], row["trial"]) in names, return_dtype=pl.Boolean
+    ))  # fmt: skip
+    assert_same(found, kept)
+
+
+def _truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _rewrite(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+
+
+def _to_palette(path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)).convert("P").save(path)
+
+
+BAD = {
+    0: ("0-0.png", _truncate, "0-0.png"),
+    1: ("1-1.png", lambda path: path.write_bytes(b""), "1-1.png"),
+    2: ("2.pfm", lambda path: path.write_bytes(b"Px" + path.read_bytes()[2:]), "2.pfm"),
+    3: ("3.pfm", _truncate, "3.pfm"),
+    4: ("4-1.png", lambda path: path.unlink(), "4-1.png"),
+    5: ("5-0.png", lambda path: _rewrite(path, lambda image: image[:, :-1]), "5-0.png"),
+}
+
+
+def test_damaged_files_are_errors_with_their_reason_and_odd_ones_are_read(tmp_path: Path) -> None:
+    folder = tmp_path / "pairs"
+    manifest = make_manifest(write_pairs(folder, 13))
+    wide = read_image(folder / "6-0.png")
+    for name, change, _ in BAD.values():
+        change(folder / name)
+    for view in (0, 1):
+        _rewrite(folder / f"6-{view}.png", lambda image: image.astype(np.uint16) * 257)
+        _rewrite(folder / f"7-{view}.png", lambda image: np.dstack([image, image, image, np.full_like(image, 9)]))
+        _to_palette(folder / f"8-{view}.png")
+        _rewrite(folder / f"12-{view}.png", lambda image: image[:1, :1])
+    (folder / "9-0.png").rename(folder / "9-2.png")  # views swapped
+    (folder / "9-1.png").rename(folder / "9-0.png")
+    (folder / "9-2.png").rename(folder / "9-1.png")
+    write_pfm(folder / "10.pfm", np.full((120, 160), np.inf, np.float32))  # nothing is known
+    write_pfm(folder / "12.pfm", np.ones((1, 1), np.float32))
+    assert (read_image(folder / "6-0.png") == wide).all()
+    out = tmp_path / "run"
+    summary = run_sweep(FAST, manifest, out, num_workers=2)
+    assert summary.progress.num_done == 13
+    errors = {row["scene"]: row for row in read_errors(out).iter_rows(named=True)}
+    assert errors.keys() == {f"{k}-0" for k in BAD}
+    for k, (_, _, word) in BAD.items():
+        assert word in errors[f"{k}-0"]["message"]
+        assert errors[f"{k}-0"]["stage"] == "read"
+    rows = {row["scene"]: row for row in read_results(out).iter_rows(named=True)}
+    assert rows.keys() == {f"{k}-0" for k in range(6, 13)}
+    assert rows["9-0"]["fraction_incorrect"] > 0.9
+    assert rows["10-0"]["num_valid"] == 0
+    assert np.isnan(rows["10-0"]["sensitivity"])
+    assert rows["12-0"]["num_matches"] == 0
+    assert rows["6-0"]["num_matches"] == rows["6-0"]["num_valid"] > 0
+
+
+@pytest.mark.slow
+def test_an_image_of_a_hundred_megapixels(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (80, 120), dtype=np.uint8)
+    image = np.zeros((8_000, 12_000), np.uint8)
+    image[4_000:4_080, 6_000:6_120] = noise
+    cv2.imwrite(str(tmp_path / "left.png"), image)
+    cv2.imwrite(str(tmp_path / "right.png"), np.roll(image, -9, 1))
+    cv2.imwrite(str(tmp_path / "gt.png"), np.full_like(image, 9))
+    (tmp_path / "pairs.csv").write_text("image0,image1,disparity_gt,gt_scale\nleft.png,right.png,gt.png,1\n")
+    manifest = make_manifest(tmp_path / "pairs.csv")
+    run_sweep(FAST, manifest, tmp_path / "run", num_workers=1)
+    (row,) = read_results(tmp_path / "run").iter_rows(named=True)
+    assert row["num_matches"] > 100
+    assert row["fraction_incorrect"] < 0.05

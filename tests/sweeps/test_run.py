@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+import torch
+
+import tensor_stereo as ts
+from tensor_stereo.cli import main
+from tensor_stereo.configs import SweepConfig
+from tensor_stereo.sweeps import SweepProgress, expand_grid, read_errors, read_matches, read_results, run_sweep
+from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, write_pairs
+
+GRID = """
+[grid]
+detector = ["fast", "gftt"]
+restriction = ["adjacency", "cardinality"]
+outlier_rate = [0.0, 0.4]
+"""
+
+
+def test_a_sweep_stores_the_rows_of_score_dataset(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
+    seen: list[SweepProgress] = []
+    summary = run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=2, on_progress=seen.append)
+    assert not summary.interrupted
+    assert summary.progress.num_done == summary.progress.num_new == 12
+    assert [state.num_done for state in seen] == sorted(state.num_done for state in seen)
+    assert_same(stored(tmp_path / "run"), expected)
+    again = run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=2)
+    assert (again.progress.num_done, again.progress.num_new) == (12, 0)
+    environment = json.loads((tmp_path / "run" / "environment.json").read_text())
+    assert [record["engine"] for record in environment] == ["local", "local"]
+    assert environment[0]["versions"]["torch"] == torch.__version__
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["message"] for line in lines] == ["start", "end", "start", "end"]
+
+
+@pytest.mark.slow
+def test_workers_shards_limits_and_parts_change_nothing(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    run_sweep(inputs.config, inputs.manifest, out, num_workers=1, shard=(2, 3), units_per_part=1)
+    run_sweep(inputs.config, inputs.manifest, out, num_workers=2, shard=(1, 3), limit=2)
+    assert len(read_results(out)) == len(expected) // 2
+    for shard in ((1, 3), (3, 3)):
+        run_sweep(inputs.config, inputs.manifest, out, num_workers=1, shard=shard, seconds_per_part=0.0)
+    assert_same(stored(out), expected)
+    assert run_sweep(inputs.config, inputs.manifest, out).progress.num_new == 0  # whole, after its shards
+
+
+@pytest.mark.slow
+def test_the_manifest_of_a_run_stays(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
+    manifest, out = tmp_path / "m.parquet", tmp_path / "run"
+    table = pl.read_parquet(inputs.manifest)
+    table.write_parquet(manifest)
+    run_sweep(inputs.config, manifest, out, num_workers=1, limit=3)
+    for edited in (table[:-1], table.with_columns(mask="image0"), table.reverse()):
+        edited.write_parquet(manifest)
+        with pytest.raises(ValueError, match="manifest"):
+            run_sweep(inputs.config, manifest, out, num_workers=1)
+    table.write_parquet(manifest)
+    run_sweep(inputs.config, manifest, out, num_workers=1)
+    assert_same(stored(out), expected)
+
+
+def test_kept_matches_come_back_for_training(inputs: Inputs, tmp_path: Path) -> None:
+    config = SweepConfig(expand_grid([{"detector": "fast", "outlier_rate": [0.0, 0.5]}]), export_matches=True)
+    out = tmp_path / "run"
+    run_sweep(config, inputs.manifest, out, num_workers=1, limit=2)
+    rows = read_results(out)
+    for row in rows.iter_rows(named=True):
+        found = read_matches(out, row["dataset"], row["scene"], trial=row["trial"])
+        assert len(found.inlier) == found.matches.num_matches == row["num_matches"]
+        verdict = ts.classify_matches(found.matches)
+        assert torch.equal(found.inlier, verdict.inlier)
+        assert torch.equal(found.relation, verdict.relation)
+        assert int((found.inlier & found.correct & found.valid).sum()) == row["true_negative"]
+        assert found.score is not None
+        assert torch.equal(found.score, ts.DelaunayFilter()(found.matches).score)
+    with pytest.raises(ValueError, match="trial 7"):
+        read_matches(out, "pairs", "0-0", trial=7)
+
+
+def test_a_run_without_matches_says_so(inputs: Inputs, tmp_path: Path) -> None:
+    run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=1, limit=1)
+    with pytest.raises(ValueError, match="export_matches"):
+        read_matches(tmp_path / "run", "pairs", "0-0")
+
+
+def test_a_bad_setting_is_told_before_anything_runs(inputs: Inputs, tmp_path: Path) -> None:
+    config = SweepConfig(expand_grid([{"detector": ["gftt", "fast"], "fast": {"window_px": 10}}]))
+    with pytest.raises(ValueError, match=r"point 0 of the grid \(fast\).*window_px"):
+        run_sweep(config, inputs.manifest, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ValueError, match="limit"):
+        run_sweep(inputs.config, inputs.manifest, tmp_path / "run", limit=-1)
+    with pytest.raises(ValueError, match="num_workers"):
+        run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=0)
+
+
+def test_the_command_runs_resumes_and_tells_failures_by_its_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sweep.toml").write_text(GRID)
+    manifest = make_manifest(write_pairs(tmp_path / "pairs", 2))
+    out = tmp_path / "run"
+    command = ["sweep", str(tmp_path / "sweep.toml"), "--manifest", str(manifest), "--out", str(out), "--workers", "1"]
+    main([*command, "--dry-run"])
+    printed = capsys.readouterr().out
+    assert "2 pairs x 8 points of the grid = 4 units" in printed
+    assert "about 0:00:0" in printed
+    assert not out.exists()
+    (tmp_path / "pairs" / "1-1.png").rename(tmp_path / "hidden.png")
+    with pytest.raises(SystemExit) as stop:
+        main(command)
+    assert stop.value.code == 1
+    assert "2 failed" in capsys.readouterr().out
+    assert read_errors(out)["error"].to_list() == ["FileNotFoundError"] * 2
+    (tmp_path / "hidden.png").rename(tmp_path / "pairs" / "1-1.png")
+    with pytest.raises(SystemExit):
+        main(command)  # a failed unit is done
+    main([*command, "--retry-errors"])
+    assert read_errors(out).is_empty()
+    assert len(read_results(out)) == 2 * 8
+    for arguments, word in (
+        ([*command, "--shard", "5"], "shard"),
+        ([*command, "--engine", "ray", "--workers", "0"], "num_workers"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        assert word in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
+    """The journal alone says what is done: no part is read, no worker starts."""
+    from tensor_stereo.datasets import write_manifest
+    from tensor_stereo.datasets.manifest import SCHEMA
+    from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
+    from tensor_stereo.sweeps.units import UnitResult
+
+    count = 10_000
+    table = pl.DataFrame(
+        {
+            "dataset": ["many"] * count,
+            "scene": [str(k) for k in range(count)],
+            "image0": ["a.png"] * count,
+            "image1": ["b.png"] * count,
+            **dict.fromkeys(["disparity_gt", "disparity_noc_gt", "mask", "calibration", "gt_scale"]),
+            "width_px": [1] * count,
+            "height_px": [1] * count,
+        },
+        {name: SCHEMA[name] for name in SCHEMA},
+    )
+    write_manifest(table, tmp_path / "m.parquet")
+    (tmp_path / "sweep.toml").write_text("")
+    out = tmp_path / "run"
+    config = SweepConfig()
+    run_sweep(config, tmp_path / "m.parquet", out, limit=0)
+    known = json.loads((out / "config.json").read_text())
+    with RunStore(out, known, table) as store:
+        for unit in range(count):
+            store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0}]))
+    command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml")]
+    command += ["--manifest", str(tmp_path / "m.parquet"), "--out", str(out)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)
+    assert result.returncode == 0, result.stderr
+    assert "10000 of 10000 units done, 0 now" in result.stdout

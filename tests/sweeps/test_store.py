@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from tensor_stereo import atomic
+from tensor_stereo.sweeps import RunInUseError, read_errors, read_results
+from tensor_stereo.sweeps.journal import read_journals
+from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
+from tensor_stereo.sweeps.units import UnitResult
+
+MANIFEST = pl.DataFrame({"scene": ["a", "b"]})
+CONFIG = {"grid": [1, 2], "manifest": {"num_pairs": 2}}
+
+
+def _good(unit: int) -> UnitResult:
+    row = dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0, "num_matches": 10 * unit}
+    return UnitResult(unit, [row])
+
+
+def _bad(unit: int, message: str = "torn") -> UnitResult:
+    names = ("dataset", "scene", "detector", "stage", "error")
+    return UnitResult(unit, [], dict.fromkeys(names, "x") | {"message": message})
+
+
+def _open(out: Path, **options: object) -> RunStore:
+    return RunStore(out, CONFIG, MANIFEST, **options)  # type: ignore[arg-type]
+
+
+def _units(out: Path) -> list[int]:
+    return read_results(out)["unit"].to_list()
+
+
+def test_parts_are_read_as_one_table(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out, units_per_part=2) as store:
+        for unit in (3, 1, 2, 5, 4):
+            store.add(_good(unit))
+    assert len(list((out / "metrics").iterdir())) == 3
+    assert _units(out) == [1, 2, 3, 4, 5]
+    assert read_results(out).schema == pl.Schema(METRICS_SCHEMA)
+
+
+def test_polars_and_duckdb_read_the_parts_without_this_library(tmp_path: Path) -> None:
+    duckdb = pytest.importorskip("duckdb")
+    out = tmp_path / "run"
+    with _open(out, units_per_part=2) as store:
+        for unit in range(5):
+            store.add(_good(unit))
+    pattern = str(out / "metrics" / "part-*.parquet")
+    assert pl.read_parquet(pattern)["num_matches"].sum() == 100
+    assert duckdb.sql(f"SELECT count(*), sum(num_matches) FROM '{pattern}'").fetchall() == [(5, 100)]
+
+
+def test_a_damaged_part_is_set_aside_and_not_done(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out, units_per_part=2) as store:
+        for unit in range(4):
+            store.add(_good(unit))
+    part = out / "metrics" / "part-1-of-1-000001.parquet"
+    part.write_bytes(part.read_bytes()[:-1])
+    with _open(out) as store:
+        assert store.state.done == {2, 3}
+        for unit in (0, 1):
+            store.add(_good(unit))
+    assert _units(out) == [0, 1, 2, 3]
+    assert pl.read_parquet(str(out / "metrics" / "part-*.parquet")).height == 4
+    assert part.with_suffix(".parquet.unlisted").exists()  # nothing is thrown away
+
+
+def test_a_changed_byte_is_found_by_verify(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_good(0))
+    part = next((out / "metrics").iterdir())
+    data = bytearray(part.read_bytes())
+    data[20] ^= 1
+    part.write_bytes(data)
+    assert read_journals(out).done == {0}
+    assert read_journals(out, verify=True).done == set()
+
+
+def test_a_torn_line_of_the_journal_is_done_again(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out, units_per_part=1) as store:
+        store.add(_good(0))
+        store.add(_good(1))
+    journal = out / "journal-1-of-1.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-10])
+    with _open(out) as store:
+        assert store.state.done == {0}
+        store.add(_good(1))
+    assert _units(out) == [0, 1]
+    assert all(json.loads(line) for line in journal.read_text().splitlines())
+
+
+def test_a_part_in_no_journal_counts_once_at_most(tmp_path: Path) -> None:
+    """A crash between the rename of a part and its line in the journal."""
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_good(0))
+    (out / "journal-1-of-1.jsonl").write_bytes(b"")
+    with _open(out) as store:
+        assert store.state.done == set()
+        store.add(_good(0))
+    assert _units(out) == [0]
+    assert pl.read_parquet(str(out / "metrics" / "part-*.parquet")).height == 1
+
+
+def test_a_later_success_replaces_an_error(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_bad(0))
+        store.add(_bad(1, "gone"))
+        store.add(_good(2))
+    assert read_errors(out)["unit"].to_list() == [0, 1]
+    assert pl.read_parquet(out / "errors.parquet").equals(read_errors(out))
+    with _open(out) as store:
+        assert store.state.done == {0, 1, 2}
+        store.add(_good(0))
+    assert read_errors(out)["message"].to_list() == ["gone"]
+    assert pl.read_parquet(out / "errors.parquet").equals(read_errors(out))
+    assert _units(out) == [0, 2]
+
+
+def test_another_configuration_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_good(0))
+    with pytest.raises(ValueError, match=r"grid\[1\] is 2 there, 3 here"):
+        RunStore(out, CONFIG | {"grid": [1, 3]}, MANIFEST)
+    assert _units(out) == [0]
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ValueError, match=r"thesis\.tex"):
+        _open(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no run"):
+        read_results(tmp_path)
+
+
+def test_one_process_a_shard(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out, shard=(1, 2)) as store:
+        with pytest.raises(RunInUseError, match="journal-1-of-2"):
+            _open(out, shard=(1, 2))
+        with pytest.raises(RunInUseError, match="journal-1-of-2"):
+            _open(out)  # another division would do the same units
+        with _open(out, shard=(2, 2)) as other:
+            other.add(_bad(1))
+            store.add(_good(0))
+            store.add(_bad(2))
+    assert _units(out) == [0]
+    assert pl.read_parquet(out / "errors.parquet")["unit"].to_list() == [1, 2]
+    with _open(out) as store:
+        assert store.state.done == {0, 1, 2}
+
+
+@pytest.mark.parametrize("survives", [0, 1, 2])
+def test_a_full_disk_loses_nothing_that_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, survives: int
+) -> None:
+    """The disk is full after so many flushes to it; then there is room again."""
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_good(0))
+    flush, left = os.fsync, survives
+
+    def full(descriptor: int) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        flush(descriptor)
+
+    store = _open(out)
+    store.add(_good(1))
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        store.flush()
+    monkeypatch.undo()
+    assert atomic.os.fsync is flush
+    assert _units(out) == [0]
+    with store:  # what is pending goes with the end
+        store.add(_good(2))
+    assert _units(out) == [0, 1, 2]
+    assert pl.read_parquet(str(out / "metrics" / "part-*.parquet")).height == 3
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to become another user")
+def test_a_read_only_folder_is_an_error(tmp_path: Path) -> None:
+    tmp_path.chmod(0o755)
+    os.seteuid(65534)
+    try:
+        with pytest.raises(PermissionError, match="run"):
+            _open(tmp_path / "run")
+    finally:
+        os.seteuid(0)

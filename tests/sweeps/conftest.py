@@ -10,10 +10,17 @@ import pytest
 from tensor_stereo.configs import SweepConfig, SyntheticConfig
 from tensor_stereo.datasets import build_manifest, write_manifest, write_pfm
 from tensor_stereo.datasets.synthetic import render_pair
-from tensor_stereo.sweeps import expand_grid, read_results
+from tensor_stereo.sweeps import read_grid, read_results
 
 SMALL = SyntheticConfig(width_px=160, height_px=120, min_disparity_px=3, max_disparity_px=20)
 OF_THE_RUN = ("seconds", "host", "attempt")  # columns that differ between runs of one sweep
+
+GRID = """
+[grid]
+detector = ["fast", "gftt"]
+restriction = ["adjacency", "cardinality"]
+outlier_rate = [0.0, 0.4]
+"""
 
 
 class Inputs(NamedTuple):
@@ -21,6 +28,7 @@ class Inputs(NamedTuple):
 
     folder: Path
     manifest: Path
+    settings: Path
     config: SweepConfig
 
 
@@ -55,8 +63,9 @@ def stored(run: Path) -> pl.DataFrame:
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     folder = tmp_path_factory.mktemp("sweep")
     manifest = make_manifest(write_pairs(folder / "pairs", 6))
-    grid = {"detector": ["fast", "gftt"], "restriction": ["adjacency", "cardinality"], "outlier_rate": [0.0, 0.4]}
-    return Inputs(folder, manifest, SweepConfig(expand_grid([grid])))
+    settings = folder / "sweep.toml"
+    settings.write_text(GRID)
+    return Inputs(folder, manifest, settings, read_grid(settings))
 
 
 @pytest.fixture(scope="session")

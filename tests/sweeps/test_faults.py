@@ -28,17 +28,15 @@ from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, wr
 FAST = SweepConfig(expand_grid([{"detector": "fast"}]))
 SCRIPT = """
 import os, signal, sys
-from tensor_stereo.sweeps import expand_grid, run_sweep
-from tensor_stereo.configs import SweepConfig
+from tensor_stereo.sweeps import read_grid, run_sweep
 from multiprocessing import active_children
 
 def fault(state):
     {fault}
 
 if __name__ == "__main__":
-    grid = dict(detector=["fast", "gftt"], restriction=["adjacency", "cardinality"], outlier_rate=[0.0, 0.4])
-    config = SweepConfig(expand_grid([grid]))
-    summary = run_sweep(config, sys.argv[1], sys.argv[2], num_workers=2, units_per_part=1, on_progress=fault)
+    settings, manifest, out = sys.argv[1:]
+    summary = run_sweep(read_grid(settings), manifest, out, num_workers=2, units_per_part=1, on_progress=fault)
     sys.exit(130 if summary.interrupted else 0)
 """
 
@@ -47,7 +45,7 @@ def _run_script(fault: str, inputs: Inputs, out: Path, **options: object) -> sub
     """A sweep in a process of its own, with a fault at every report of progress."""
     script = out.parent / "script.py"
     script.write_text(SCRIPT.format(fault=fault))
-    command = [sys.executable, str(script), str(inputs.manifest), str(out)]
+    command = [sys.executable, str(script), str(inputs.settings), str(inputs.manifest), str(out)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)  # type: ignore[call-overload, no-any-return]
 
 
@@ -117,10 +115,7 @@ def test_a_signal_finishes_what_is_under_way(
 @pytest.mark.slow
 def test_two_processes_on_one_run(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    (tmp_path / "sweep.toml").write_text(
-        '[grid]\ndetector = ["fast", "gftt"]\nrestriction = ["adjacency", "cardinality"]\noutlier_rate = [0.0, 0.4]\n'
-    )
-    command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml"), "--out", str(out)]
+    command = [sys.executable, "-m", "tensor_stereo", "sweep", str(inputs.settings), "--out", str(out)]
     command += ["--manifest", str(inputs.manifest)]
     refused = []
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ import polars as pl
 import pytest
 
 from tensor_stereo.sweeps import SweepProgress, read_results, run_sweep
-from tests.sweeps.conftest import Inputs, assert_same, stored
+from tests.sweeps.conftest import GRID, Inputs, assert_same, stored
 
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # Ray's own, of sockets and future changes
 
@@ -76,38 +77,40 @@ def test_a_killed_worker_and_a_removed_node_lose_no_unit(
     assert (read_results(tmp_path / "run")["attempt"] > 1).any()
 
 
+def _start(*options: str) -> subprocess.Popen[str]:
+    """A Ray node in the foreground, running when this returns."""
+    ray = Path(sys.executable).with_name("ray")
+    command = [ray, "start", *options, "--num-cpus", "1", "--block", "--disable-usage-stats"]
+    node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # type: ignore[arg-type]
+    printed = []
+    assert node.stdout is not None
+    for line in node.stdout:
+        printed.append(line)
+        if "Ray runtime started" in line:
+            return node
+    raise AssertionError("".join(printed))
+
+
 def test_the_command_joins_a_cluster_that_ray_start_made(
     inputs: Inputs, expected: pl.DataFrame, tmp_path: Path
 ) -> None:
-    """As the README says: a head, a second node on the loopback device, the address on the command line."""
+    """As the README says: a head, a second node, the address on the command line."""
     pytest.importorskip("ray")
-    ray = str(Path(sys.executable).with_name("ray"))
-    environment = os.environ | {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "disabled"}
-    quiet = {"check": True, "capture_output": True, "text": True, "env": environment}
-    port = "6391"
-    head = [
-        "--head",
-        "--node-ip-address",
-        "127.0.0.1",
-        "--port",
-        port,
-        "--num-cpus",
-        "1",
-        "--include-dashboard",
-        "false",
-    ]
-    grid = (
-        '[grid]\ndetector = ["fast", "gftt"]\nrestriction = ["adjacency", "cardinality"]\noutlier_rate = [0.0, 0.4]\n'
-    )
-    (tmp_path / "sweep.toml").write_text(grid)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (tmp_path / "sweep.toml").write_text(GRID)
+    nodes: list[subprocess.Popen[str]] = []
     try:
-        subprocess.run([ray, "start", *head], **quiet)  # type: ignore[call-overload]
-        subprocess.run([ray, "start", "--address", f"127.0.0.1:{port}", "--num-cpus", "1"], **quiet)  # type: ignore[call-overload]
+        nodes.append(_start("--head", "--node-ip-address", "127.0.0.1", "--port", str(port)))
+        nodes.append(_start("--address", f"127.0.0.1:{port}"))
         command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml"), "--engine", "ray"]
         command += ["--manifest", str(inputs.manifest), "--out", str(tmp_path / "run")]
         command += ["--ray-address", f"127.0.0.1:{port}"]
-        result = subprocess.run(command, **quiet)  # type: ignore[call-overload]
-        assert "12 of 12 units done" in result.stdout
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert "12 of 12 units done" in result.stdout, result.stderr
     finally:
-        subprocess.run([ray, "stop", "--force"], capture_output=True, check=False)
+        for node in reversed(nodes):
+            node.terminate()
+            node.communicate(timeout=60)
     assert_same(stored(tmp_path / "run"), expected)

@@ -14,14 +14,7 @@ import tensor_stereo as ts
 from tensor_stereo.cli import main
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.sweeps import SweepProgress, expand_grid, read_errors, read_matches, read_results, run_sweep
-from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, write_pairs
-
-GRID = """
-[grid]
-detector = ["fast", "gftt"]
-restriction = ["adjacency", "cardinality"]
-outlier_rate = [0.0, 0.4]
-"""
+from tests.sweeps.conftest import GRID, Inputs, assert_same, make_manifest, stored, write_pairs
 
 
 def test_a_sweep_stores_the_rows_of_score_dataset(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:

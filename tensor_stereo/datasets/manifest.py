@@ -125,7 +125,10 @@ def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]
             raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
         if table[name].dtype not in (dtype, pl.Null):
             raise ValueError(f"{path}: column {name!r} must be {dtype}, got {table[name].dtype}")
-    pairs = [_to_pair(path, row, values, check_files) for row, values in enumerate(table.select(list(SCHEMA)).iter_rows(named=True))]
+    pairs = [
+        _to_pair(path, row, values, check_files)
+        for row, values in enumerate(table.select(list(SCHEMA)).iter_rows(named=True))
+    ]
     _check_names(pairs)
     return pairs
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from tensor_stereo.types import Adjacency, Classification, Matches, Relation, ch
 # hues that stay apart for the common colour blindnesses (Okabe & Ito, 2008)
 BLUE, VERMILLION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#595959"
 DPI = 100
-_PANEL_AREA_IN2, _MIN_WIDTH_IN, _MAX_WIDTH_IN = 22.0, 5.2, 9.0  # of one of the four panels
+_PANEL_AREA_IN2, _MIN_WIDTH_IN, _MAX_WIDTH_IN = 22.0, 5.2, 9.0  # of one panel
 _GAP_IN, _TITLE_IN, _LABEL_IN, _LEGEND_IN = 0.12, 0.36, 0.24, 0.34
 _FONT_SIZE = 9
 
@@ -101,13 +102,7 @@ def draw_classification(
         >>> len(draw_classification(image, image, matches, verdict, graph, graph).axes)
         4
     """
-    if matches.num_pairs != 1:
-        raise ValueError(f"matches must be of one pair, got {matches.num_pairs}")
-    for name, image in (("image0", image0), ("image1", image1)):
-        if image.ndim != 3 or image.shape[0] not in (1, 3):
-            raise ValueError(f"{name} must have shape (C, H, W) with C = 1 or 3, got {tuple(image.shape)}")
-        if image.dtype != torch.uint8:
-            raise TypeError(f"{name} must be uint8, got {image.dtype}")
+    _check_pair(image0, image1, matches)
     for name, adjacency in (("adjacency0", adjacency0), ("adjacency1", adjacency1)):
         if adjacency.num_nodes != matches.num_matches:
             raise ValueError(f"{name} must have {matches.num_matches} nodes, one per match, got {adjacency.num_nodes}")
@@ -116,12 +111,10 @@ def draw_classification(
     edges = [_edges(adjacency0), _edges(adjacency1)]
     shared = [np.isin(edges[view], edges[1 - view]) for view in (0, 1)]
 
-    layout = _Layout(image0, title)
+    layout = _Layout(image0, title, num_rows=2)
     for view, (image, contours) in enumerate(((image0, contours0), (image1, contours1))):
         gray = _gray(image)
-        upper = layout.panel(0, view, f"view {view} ({('left', 'right')[view]})", gray, strength=0.5)
-        for item in reversed(classes):  # the first on top
-            item.draw(upper, keypoints[view])
+        layout.draw_matches(view, gray, classes, keypoints[view])
         num_edges, num_shared = len(edges[view]), int(shared[view].sum())
         label = f"Delaunay graph of view {view}: {num_edges} edges, {num_shared} of them in both views"
         lower = layout.panel(1, view, label, gray, strength=0.25)
@@ -137,6 +130,35 @@ def draw_classification(
     if contours0 is not None or contours1 is not None:
         lines["object contour"] = GREEN
     layout.legend(1, [Line2D([], [], color=color, linewidth=1.5, label=label) for label, color in lines.items()])
+    return layout.figure
+
+
+def draw_matches(
+    image0: Tensor,
+    image1: Tensor,
+    matches: Matches,
+    inlier: Tensor,
+    *,
+    correct: Tensor,
+    valid: Tensor,
+    title: str = "",
+) -> Figure:
+    """Draw the matches of one pair by verdict and truth, as the upper half of :func:`draw_classification`.
+
+    Arguments and errors are those of :func:`draw_classification`; ``inlier`` (M,) bool is the verdict.
+
+    Example:
+        >>> image, points = torch.zeros(1, 20, 30, dtype=torch.uint8), torch.tensor([[3.0, 4.0]])
+        >>> matches, kept = Matches(points, points, torch.tensor([0, 1])), torch.tensor([True])
+        >>> len(draw_matches(image, image, matches, kept, correct=kept, valid=kept).axes)
+        2
+    """
+    _check_pair(image0, image1, matches)
+    classes = _truth_classes(inlier, correct, valid, matches.num_matches)
+    layout = _Layout(image0, title, num_rows=1)
+    for view, (image, points) in enumerate(((image0, matches.keypoints0), (image1, matches.keypoints1))):
+        layout.draw_matches(view, _gray(image), classes, points.numpy(force=True))
+    layout.legend(0, [item.handle() for item in classes])
     return layout.figure
 
 
@@ -162,31 +184,44 @@ def write_figure(figure: Figure, path: Path | str) -> None:
         ['empty.png']
     """
     path = Path(path)
-    if path.suffix.lower() != ".png":
+    if path.suffix.lower() == ".png":
+        path.write_bytes(figure_png(figure))
+    else:
         figure.savefig(path)
-        return
+
+
+def figure_png(figure: Figure) -> bytes:
+    """The bytes of the PNG file that :func:`write_figure` writes.
+
+    Example:
+        >>> figure_png(Figure(figsize=(1, 1)))[1:4]
+        b'PNG'
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(256, dither=Image.Dither.NONE).save(path, dpi=(figure.dpi, figure.dpi))
+    file = io.BytesIO()
+    image.quantize(256, dither=Image.Dither.NONE).save(file, "PNG", dpi=(figure.dpi, figure.dpi))
+    return file.getvalue()
 
 
 class _Layout:
-    """Two rows of two panels with the images' aspect, a legend under each row, sizes in inches."""
+    """Rows of two panels with the images' aspect, a legend under each row, sizes in inches."""
 
-    def __init__(self, image: Tensor, title: str) -> None:
+    def __init__(self, image: Tensor, title: str, *, num_rows: int) -> None:
         height, width = image.shape[-2:]
         aspect = width / height
         self.width = float(np.clip((_PANEL_AREA_IN2 * aspect) ** 0.5, _MIN_WIDTH_IN, _MAX_WIDTH_IN))
         self.height = self.width / aspect
         self.row = _LABEL_IN + self.height + _LEGEND_IN
-        self.size = (2 * self.width + 3 * _GAP_IN, (_TITLE_IN if title else 0) + 2 * self.row + _GAP_IN)
+        self.num_rows = num_rows
+        self.size = (2 * self.width + 3 * _GAP_IN, (_TITLE_IN if title else 0) + num_rows * self.row + _GAP_IN)
         self.figure = Figure(figsize=self.size, dpi=DPI)
         if title:
             self.figure.text(0.5, 1 - 0.5 * _TITLE_IN / self.size[1], title, ha="center", va="center", fontsize=12)
 
     def _bottom(self, row: int) -> float:
-        return _GAP_IN + (1 - row) * self.row + _LEGEND_IN
+        return _GAP_IN + (self.num_rows - 1 - row) * self.row + _LEGEND_IN
 
     def panel(self, row: int, column: int, label: str, gray: NDArray[np.uint8], *, strength: float) -> Axes:
         """Axes in pixel coordinates over the image, faded towards white."""
@@ -200,6 +235,13 @@ class _Layout:
         axes.set_title(label, pad=3, fontsize=_FONT_SIZE)
         axes.spines[:].set_visible(False)
         return axes
+
+    def draw_matches(
+        self, view: int, gray: NDArray[np.uint8], classes: Sequence[_Class], keypoints: NDArray[np.floating]
+    ) -> None:
+        axes = self.panel(0, view, f"view {view} ({('left', 'right')[view]})", gray, strength=0.5)
+        for item in reversed(classes):  # the first on top
+            item.draw(axes, keypoints)
 
     def legend(self, row: int, handles: list[Line2D]) -> None:
         y = (self._bottom(row) - 0.5 * _LEGEND_IN) / self.size[1]
@@ -218,9 +260,9 @@ def _classes(
     classification: Classification, correct: Tensor | None, valid: Tensor | None, num_matches: int
 ) -> list[_Class]:
     """How the matches are told apart, the errors that matter most first."""
-    check_vector("classification.inlier", classification.inlier, num_matches)
-    kept: NDArray[np.bool_] = classification.inlier.numpy(force=True)
     if correct is None and valid is None:
+        check_vector("classification.inlier", classification.inlier, num_matches)
+        kept: NDArray[np.bool_] = classification.inlier.numpy(force=True)
         untested = classification.relation.numpy(force=True) == Relation.UNTESTED
         return [
             _Class("kept", kept, BLUE, "o"),
@@ -229,9 +271,14 @@ def _classes(
         ]
     if correct is None or valid is None:
         raise ValueError("correct and valid must be given together, got only one of them")
+    return _truth_classes(classification.inlier, correct, valid, num_matches)
+
+
+def _truth_classes(inlier: Tensor, correct: Tensor, valid: Tensor, num_matches: int) -> list[_Class]:
+    check_vector("inlier", inlier, num_matches)
     check_vector("correct", correct, num_matches)
     check_vector("valid", valid, num_matches)
-    right, known = correct.numpy(force=True), valid.numpy(force=True)
+    kept, right, known = inlier.numpy(force=True), correct.numpy(force=True), valid.numpy(force=True)
     classes = [
         _Class("kept, incorrect", kept & known & ~right, VERMILLION, "o"),
         _Class("kept, correct", kept & known & right, BLUE, "o"),
@@ -241,6 +288,17 @@ def _classes(
         _Class("rejected, unknown", ~kept & ~known, GREY, "x"),
     ]
     return [item for item in classes if item.color != GREY or item.mask.any()]
+
+
+def _check_pair(image0: Tensor, image1: Tensor, matches: Matches) -> None:
+    """Raise unless there is one pair and its images can be drawn."""
+    if matches.num_pairs != 1:
+        raise ValueError(f"matches must be of one pair, got {matches.num_pairs}")
+    for name, image in (("image0", image0), ("image1", image1)):
+        if image.ndim != 3 or image.shape[0] not in (1, 3):
+            raise ValueError(f"{name} must have shape (C, H, W) with C = 1 or 3, got {tuple(image.shape)}")
+        if image.dtype != torch.uint8:
+            raise TypeError(f"{name} must be uint8, got {image.dtype}")
 
 
 def _edges(adjacency: Adjacency) -> NDArray[np.int64]:

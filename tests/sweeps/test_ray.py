@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -77,11 +78,11 @@ def test_a_killed_worker_and_a_removed_node_lose_no_unit(
     assert (read_results(tmp_path / "run")["attempt"] > 1).any()
 
 
-def _start(*options: str) -> subprocess.Popen[str]:
+def _start(environment: dict[str, str], *options: str) -> subprocess.Popen[str]:
     """A Ray node in the foreground, running when this returns."""
     ray = Path(sys.executable).with_name("ray")
     command = [ray, "start", *options, "--num-cpus", "1", "--block", "--disable-usage-stats"]
-    node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)  # type: ignore[arg-type]
+    node = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)  # type: ignore[arg-type]
     printed = []
     assert node.stdout is not None
     for line in node.stdout:
@@ -100,14 +101,15 @@ def test_the_command_joins_a_cluster_that_ray_start_made(
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     (tmp_path / "sweep.toml").write_text(GRID)
+    environment = os.environ | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     nodes: list[subprocess.Popen[str]] = []
     try:
-        nodes.append(_start("--head", "--node-ip-address", "127.0.0.1", "--port", str(port)))
-        nodes.append(_start("--address", f"127.0.0.1:{port}"))
+        nodes.append(_start(environment, "--head", "--node-ip-address", "127.0.0.1", "--port", str(port)))
+        nodes.append(_start(environment, "--address", f"127.0.0.1:{port}"))
         command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml"), "--engine", "ray"]
         command += ["--manifest", str(inputs.manifest), "--out", str(tmp_path / "run")]
         command += ["--ray-address", f"127.0.0.1:{port}"]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
         assert "12 of 12 units done" in result.stdout, result.stderr
     finally:
         for node in reversed(nodes):

@@ -100,4 +100,4 @@ def _select(pairs: Sequence[PairFiles], scenes: Iterable[str]) -> list[PairFiles
 
 def _has_release_scale(pair: PairFiles) -> bool:
     is_map = pair.disparity_gt is not None and pair.disparity_gt.suffix != ".pfm"
-    return is_map and not pair.dataset.startswith(("kitti", "sintel"))
+    return is_map and pair.gt_encoding == "scaled" and not pair.dataset.startswith("kitti")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 StrPath: TypeAlias = str | os.PathLike[str]
+GT_ENCODINGS = ("scaled", "sintel")
 
 MAX_DEPTH = 6  # data/middlebury/scenes2005/FullSize/zip-2views/Art, with one level to spare
 _SKIPPED = re.compile(r"\..*|__MACOSX|Illum\d+", re.IGNORECASE)  # Illum: the same scene under other lights (2005, 2006)
@@ -29,6 +30,8 @@ class PairFiles:
         mask: ``mask0nocc.png`` of MiddEval3 and ETH3D.
         disparity_noc_gt: KITTI's map that holds the visible pixels only, on the scale of ``disparity_gt``.
         calibration: ``calib.txt`` in Middlebury's format.
+        gt_encoding: how the maps hold their values: ``scaled`` (value / gt_scale, or PFM), or ``sintel`` (three
+            channels, as its archive says).
     """
 
     dataset: str
@@ -40,6 +43,7 @@ class PairFiles:
     mask: Path | None = None
     disparity_noc_gt: Path | None = None
     calibration: Path | None = None
+    gt_encoding: str = "scaled"
 
 
 FolderReader: TypeAlias = Callable[[Path], list[PairFiles]]

@@ -12,7 +12,7 @@ import polars as pl
 from tensor_stereo.atomic import whole_file
 
 from .discovery import find_pairs
-from .files import PairFiles, StrPath, check_gt_scale
+from .files import GT_ENCODINGS, PairFiles, StrPath, check_gt_scale
 from .image_size import image_size
 
 _PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration")
@@ -21,10 +21,11 @@ SCHEMA = {
     "scene": pl.String,  # unique within its dataset
     **dict.fromkeys(_PATHS, pl.String),  # absolute paths; null where the release has no such file
     "gt_scale": pl.Float64,  # stored value / gt_scale = disparity in px; null without ground truth
+    "gt_encoding": pl.String,  # scaled, or sintel: how the maps hold their values
     "width_px": pl.Int32,  # of image0
     "height_px": pl.Int32,
 }
-_REQUIRED = ("dataset", "scene", "image0", "image1", "width_px", "height_px")
+_REQUIRED = ("dataset", "scene", "image0", "image1", "gt_encoding", "width_px", "height_px")
 _LISTED = ("image0", "image1")  # what a CSV of paths must have
 
 
@@ -32,8 +33,8 @@ def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -
     r"""Find the pairs of folders and lists of paths; only headers of images are read.
 
     A list is a CSV file with the columns ``image0`` and ``image1`` and any of ``disparity_gt``, ``gt_scale``,
-    ``disparity_noc_gt``, ``mask``, ``calibration``, ``dataset`` (default: the file's name) and ``scene`` (default: the
-    name of ``image0`` without ending). Its paths are absolute or relative to its own folder.
+    ``gt_encoding``, ``disparity_noc_gt``, ``mask``, ``calibration``, ``dataset`` (default: the file's name) and
+    ``scene`` (default: the name of ``image0`` without ending). Its paths are absolute or relative to its own folder.
 
     Args:
         roots: folders as :func:`~tensor_stereo.datasets.find_pairs` takes them, and ``.csv`` files. A pair that lies
@@ -77,6 +78,7 @@ def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -
                 "scene": pair.scene,
                 **{name: None if path is None else str(path.resolve()) for name, path in paths.items()},
                 "gt_scale": pair.gt_scale,
+                "gt_encoding": pair.gt_encoding,
                 "width_px": width,
                 "height_px": height,
             }
@@ -144,11 +146,14 @@ def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool)
     scale = values["gt_scale"]
     if scale is not None and not (isinstance(scale, float) and 0 < scale < math.inf):
         raise ValueError(f"{path}, row {row}: column 'gt_scale' must be positive and finite, got {scale}")
+    encoding = str(values["gt_encoding"])
+    if encoding not in GT_ENCODINGS:
+        raise ValueError(f"{path}, row {row}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}")
     paths = {name: None if values[name] is None else Path(str(values[name])) for name in _PATHS}
     for name, file in paths.items():
         if check_files and file is not None and not file.is_file():
             raise ValueError(f"{path}, row {row}: column {name!r} names {file}, which is no file")
-    return PairFiles(str(values["dataset"]), str(values["scene"]), gt_scale=scale, **paths)  # type: ignore[arg-type]
+    return PairFiles(str(values["dataset"]), str(values["scene"]), gt_scale=scale, gt_encoding=encoding, **paths)  # type: ignore[arg-type]
 
 
 def _read_list(path: Path) -> list[PairFiles]:
@@ -179,11 +184,14 @@ def _read_list(path: Path) -> list[PairFiles]:
             check_gt_scale(scale)
         except ValueError as error:
             raise ValueError(f"{path}, row {row}: column 'gt_scale': {error}") from error
+        encoding = values.get("gt_encoding") or "scaled"
+        if encoding not in GT_ENCODINGS:
+            raise ValueError(f"{path}, row {row}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}")
         disparity = paths.get("disparity_gt")
-        if disparity is not None and scale is None and disparity.suffix.casefold() != ".pfm":
+        if disparity is not None and scale is None and encoding == "scaled" and disparity.suffix.casefold() != ".pfm":
             raise ValueError(f"{path}, row {row}: column 'gt_scale' is empty, but {disparity} is no PFM file")
         dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
-        pairs.append(PairFiles(dataset, scene, gt_scale=scale, **paths))
+        pairs.append(PairFiles(dataset, scene, gt_scale=scale, gt_encoding=encoding, **paths))
     return pairs
 
 

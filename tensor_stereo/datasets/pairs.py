@@ -24,7 +24,6 @@ from .images import (
     read_sintel_occlusion,
 )
 from .pfm import FloatMap, read_pfm
-from .sintel import DATASET as SINTEL
 
 
 def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
@@ -105,7 +104,7 @@ class PairDataset(Dataset[StereoPair]):
 def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> FloatMap:
     """(H, W) float32 in px, NaN where unknown."""
     scale = files.gt_scale if gt_scale is None else gt_scale
-    if files.dataset.startswith(SINTEL):
+    if files.gt_encoding == "sintel":
         return read_sintel_disparity(path)
     if path.suffix != ".pfm":
         if scale is None:
@@ -121,7 +120,7 @@ def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> Flo
 
 def _read_occluded(files: PairFiles, disparity: FloatMap, gt_scale: float | None) -> NDArray[np.bool_] | None:
     """(H, W) bool from whatever the release tells of occlusion, None if it is silent."""
-    if files.mask is not None and files.dataset.startswith(SINTEL):
+    if files.mask is not None and files.gt_encoding == "sintel":
         return read_sintel_occlusion(files.mask)
     if files.mask is not None:
         return read_occlusion_mask(files.mask)

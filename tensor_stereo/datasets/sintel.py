@@ -6,7 +6,6 @@ from pathlib import Path
 
 from .files import PairFiles, StrPath, collect_pairs
 
-DATASET = "sintel"
 _PASSES = ("clean", "final")
 
 
@@ -52,13 +51,14 @@ def sintel_pairs(folder: Path) -> list[PairFiles]:
             disparity, mask = (folder / name / inner for name in ("disparities", "occlusions"))
             pairs.append(
                 PairFiles(
-                    dataset=f"{DATASET}-{kind}",
+                    dataset=f"sintel-{kind}",
                     scene=inner.with_suffix("").as_posix(),
                     image0=image0,
                     image1=right / inner,
                     disparity_gt=disparity if disparity.is_file() else None,
                     gt_scale=1.0 if disparity.is_file() else None,
                     mask=mask if mask.is_file() else None,
+                    gt_encoding="sintel",
                 )
             )
     return pairs

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import polars as pl
 import pytest
 
-from tensor_stereo.datasets import find_pairs
+from tensor_stereo.datasets import find_pairs, read_pair, write_pfm
 from tensor_stereo.datasets.manifest import SCHEMA, build_manifest, read_manifest, write_manifest
 
 
@@ -122,3 +124,18 @@ def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
         build_manifest([])
     with pytest.raises(TypeError, match="sequence of paths"):
         build_manifest(str(tmp_path))  # type: ignore[arg-type]
+
+
+def test_a_name_says_nothing_of_the_encoding(tmp_path: Path) -> None:
+    """A list of one's own that is named after a release with maps in colours."""
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((4, 5), 9, np.uint8))
+    write_pfm(tmp_path / "d.pfm", np.full((4, 5), 2, np.float32))
+    (tmp_path / "sintel-mine.csv").write_text("image0,image1,disparity_gt\na.png,b.png,d.pfm\n")
+    write_manifest(build_manifest([tmp_path / "sintel-mine.csv"]), tmp_path / "m.parquet")
+    pair = read_pair(read_manifest(tmp_path / "m.parquet")[0])
+    assert pair.disparity_gt is not None
+    assert (pair.disparity_gt == 2).all()
+    (tmp_path / "wrong.csv").write_text("image0,image1,gt_encoding\na.png,b.png,colour\n")
+    with pytest.raises(ValueError, match=r"wrong\.csv, row 0: column 'gt_encoding'.*'colour'"):
+        build_manifest([tmp_path / "wrong.csv"])

@@ -74,6 +74,16 @@ class Index:
 
 
 @dataclass(frozen=True)
+class Report:
+    """Write the report of a sweep, or of two that it compares, as HTML and Markdown."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """One run folder, or two: differences are second - first."""
+    out: Path | None = None
+    """Folder for report.html and report.md; the last run folder if not given."""
+
+
+@dataclass(frozen=True)
 class Sweep:
     """Run every pair of a manifest through a grid of settings; a run that ended early goes on where it was."""
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Sweep
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Report, Sweep
 from tensor_stereo.cli.sweep import run_sweep_command
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
@@ -18,10 +18,12 @@ from tensor_stereo.datasets.synthetic import SyntheticDataset
 from tensor_stereo.evaluation import PairEvaluation, evaluate_dataset
 from tensor_stereo.reports.evaluation import write_evaluation
 from tensor_stereo.reports.matches import classify_files
+from tensor_stereo.reports.sweep.report import write_report
+from tensor_stereo.reports.sweep.runs import load_run
 from tensor_stereo.reports.tables import Table, to_markdown
 
 
-def run(command: Demo | Classify | Evaluate | Index | Sweep) -> int:
+def run(command: Demo | Classify | Evaluate | Index | Report | Sweep) -> int:
     """Dispatch a parsed command; its exit code."""
     match command:
         case Demo():
@@ -32,6 +34,8 @@ def run(command: Demo | Classify | Evaluate | Index | Sweep) -> int:
             _run_evaluate(command)
         case Index():
             _run_index(command)
+        case Report():
+            _run_report(command)
         case Sweep():
             return run_sweep_command(command)
     return 0
@@ -64,6 +68,11 @@ def _run_index(command: Index) -> None:
     for dataset, count in sorted(Counter(manifest["dataset"]).items()):
         print(f"{dataset}: {count} pairs")
     print(f"{len(manifest)} pairs in {command.out}")
+
+
+def _run_report(command: Report) -> None:
+    for path in write_report([load_run(run) for run in command.runs], command.out or command.runs[-1]):
+        print(path)
 
 
 def _run_classify(command: Classify) -> None:

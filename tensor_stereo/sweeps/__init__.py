@@ -7,6 +7,7 @@ from .grid import read_grid as read_grid
 from .journal import RunInUseError as RunInUseError
 from .plan import Plan as Plan
 from .plan import build_plan as build_plan
+from .results import read_config as read_config
 from .results import read_errors as read_errors
 from .results import read_matches as read_matches
 from .results import read_results as read_results

@@ -130,7 +130,7 @@ def _axes(table: Any, config: type, prefix: str) -> Iterator[tuple[tuple[str, ..
 def _convert(name: str, value: Any, hint: Any) -> Any:
     """A value of the type that a setting has."""
     if get_origin(hint) is UnionType:  # float | None
-        if value == "none":
+        if value is None or value == "none":
             return None
         (hint,) = (part for part in get_args(hint) if part is not NoneType)
     if get_origin(hint) is Literal:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import polars as pl
 import torch
 from torch import Tensor
 
+from tensor_stereo.configs import SweepConfig
+from tensor_stereo.sweeps.grid import expand_grid
 from tensor_stereo.sweeps.journal import read_journals
 from tensor_stereo.sweeps.store import ERRORS_SCHEMA, MATCHES_SCHEMA, METRICS_SCHEMA
 from tensor_stereo.types import Matches
@@ -42,6 +45,17 @@ def read_results(run: Path | str) -> pl.DataFrame:
         FileNotFoundError: if ``run`` is no run folder.
     """
     return _read_parts(run, "metrics", METRICS_SCHEMA).collect().sort("unit", "trial")
+
+
+def read_config(run: Path | str) -> SweepConfig:
+    """The points of the grid, in the order of their numbers.
+
+    Raises:
+        FileNotFoundError: if ``run`` is no run folder.
+    """
+    stored = json.loads((_check_run(run) / "config.json").read_text(encoding="utf-8"))["sweep"]
+    trials = tuple(trial for table in stored["trials"] for trial in expand_grid([table]))
+    return SweepConfig(trials, stored["export_matches"])
 
 
 def read_errors(run: Path | str) -> pl.DataFrame:

@@ -13,7 +13,7 @@ import torch
 import tensor_stereo as ts
 from tensor_stereo.cli import main
 from tensor_stereo.configs import SweepConfig
-from tensor_stereo.sweeps import SweepProgress, expand_grid, read_errors, read_matches, read_results, run_sweep
+from tensor_stereo.sweeps import SweepProgress, expand_grid, read_config, read_errors, read_matches, read_results, run_sweep
 from tests.sweeps.conftest import GRID, Inputs, assert_same, make_manifest, stored, write_pairs
 
 
@@ -26,6 +26,7 @@ def test_a_sweep_stores_the_rows_of_score_dataset(inputs: Inputs, expected: pl.D
     assert_same(stored(tmp_path / "run"), expected)
     again = run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=2)
     assert (again.progress.num_done, again.progress.num_new) == (12, 0)
+    assert read_config(tmp_path / "run") == inputs.config
     environment = json.loads((tmp_path / "run" / "environment.json").read_text())
     assert [record["engine"] for record in environment] == ["local", "local"]
     assert environment[0]["versions"]["torch"] == torch.__version__

@@ -8,13 +8,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Report, Sweep
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Render, Report, Sweep
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Classify, tyro.conf.subcommand("classify")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Index, tyro.conf.subcommand("index")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
 )

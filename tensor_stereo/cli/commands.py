@@ -74,6 +74,18 @@ class Index:
 
 
 @dataclass(frozen=True)
+class Render:
+    """Write pairs of the synthetic set, with exact ground truth and a list for index."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder for the images, the maps and synthetic.csv."""
+    num_pairs: int = 8
+    """Pairs to render."""
+    seed: int = 0
+    """Seed of the rendered scenes."""
+
+
+@dataclass(frozen=True)
 class Report:
     """Write the report of a sweep, or of two that it compares, as HTML and Markdown."""
 

@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Report, Sweep
+from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Render, Report, Sweep
 from tensor_stereo.cli.sweep import run_sweep_command
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
-from tensor_stereo.datasets.synthetic import SyntheticDataset
+from tensor_stereo.datasets.synthetic import SyntheticDataset, write_synthetic
 from tensor_stereo.evaluation import PairEvaluation, evaluate_dataset
 from tensor_stereo.reports.evaluation import write_evaluation
 from tensor_stereo.reports.matches import classify_files
@@ -23,7 +23,7 @@ from tensor_stereo.reports.sweep.runs import load_run
 from tensor_stereo.reports.tables import Table, to_markdown
 
 
-def run(command: Demo | Classify | Evaluate | Index | Report | Sweep) -> int:
+def run(command: Demo | Classify | Evaluate | Index | Render | Report | Sweep) -> int:
     """Dispatch a parsed command; its exit code."""
     match command:
         case Demo():
@@ -34,6 +34,8 @@ def run(command: Demo | Classify | Evaluate | Index | Report | Sweep) -> int:
             _run_evaluate(command)
         case Index():
             _run_index(command)
+        case Render():
+            print(write_synthetic(command.out, command.num_pairs, seed=command.seed))
         case Report():
             _run_report(command)
         case Sweep():

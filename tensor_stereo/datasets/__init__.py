@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .sintel import find_sintel as find_sintel
     from .synthetic import SyntheticDataset as SyntheticDataset
     from .synthetic import render_pair as render_pair
+    from .synthetic import write_synthetic as write_synthetic
 
 _MODULES = {
     "Calibration": "calibration",
@@ -50,6 +51,7 @@ _MODULES = {
     "render_pair": "synthetic",
     "write_manifest": "manifest",
     "write_pfm": "pfm",
+    "write_synthetic": "synthetic",
 }
 
 

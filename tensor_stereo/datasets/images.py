@@ -51,6 +51,27 @@ def read_image(path: StrPath) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(channels, dtype=np.uint8))
 
 
+def write_image(path: StrPath, image: Tensor) -> None:
+    """Write an image that :func:`read_image` reads back unchanged.
+
+    Args:
+        path: ends in ``.png``, or another lossless format of OpenCV's.
+        image: (C, H, W) uint8; C = 1 for grey, 3 for RGB.
+
+    Raises:
+        OSError: if it cannot be written.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_image(f"{folder}/a.png", torch.tensor([[[1, 2]]], dtype=torch.uint8))
+    ...     read_image(f"{folder}/a.png")
+    tensor([[[1, 2]]], dtype=torch.uint8)
+    """
+    pixels = image.numpy(force=True).transpose(1, 2, 0)[..., ::-1]  # RGB -> BGR
+    encoded = cv2.imencode(Path(path).suffix, np.ascontiguousarray(pixels))[1]
+    Path(path).write_bytes(encoded.tobytes())
+
+
 def read_disparity_png(path: StrPath, scale: float) -> NDArray[np.float32]:
     """Read an 8-bit or 16-bit grey disparity map (PNG or PGM); 0 means unknown.
 

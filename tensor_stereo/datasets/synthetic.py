@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from tensor_stereo.configs import SyntheticConfig
+from tensor_stereo.datasets.files import StrPath
+from tensor_stereo.datasets.images import write_image
+from tensor_stereo.datasets.pfm import write_pfm
 from tensor_stereo.datasets.scenes import build_scene
 from tensor_stereo.datasets.surfaces import Scene
 from tensor_stereo.datasets.textures import Float
@@ -154,6 +158,45 @@ class SyntheticDataset(Dataset[StereoPair]):
             raise IndexError(f"index must lie within the {self.num_pairs} pairs, got {index}")
         k %= self.num_pairs
         return render_pair((self.seed, k), self.config, name=f"synthetic-{k:02d}")
+
+
+def write_synthetic(
+    folder: StrPath, num_pairs: int = 8, *, seed: int = 0, config: SyntheticConfig = _DEFAULT_CONFIG
+) -> Path:
+    """Write rendered pairs as PNG images and PFM maps, with the list of them that a manifest is built from.
+
+    Args:
+        folder: made if it is not there.
+        num_pairs: pairs of :class:`SyntheticDataset` to write.
+        seed: of that set.
+        config: of that set.
+
+    Returns:
+        ``folder/synthetic.csv``, for :func:`tensor_stereo.datasets.build_manifest`.
+
+    Raises:
+        OSError: if a file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_synthetic(folder, 1).read_text().splitlines()[1]
+        'synthetic-00,synthetic-00-0.png,synthetic-00-1.png,synthetic-00.pfm'
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["scene,image0,image1,disparity_gt"]
+    dataset = SyntheticDataset(num_pairs, seed=seed, config=config)
+    for pair in (dataset[k] for k in range(num_pairs)):
+        names = [f"{pair.name}-0.png", f"{pair.name}-1.png", f"{pair.name}.pfm"]
+        for name, image in zip(names, (pair.image0, pair.image1), strict=False):
+            write_image(folder / name, image)
+        if pair.disparity_gt is not None:
+            write_pfm(folder / names[2], pair.disparity_gt.numpy())
+        lines.append(",".join([pair.name, *names]))
+    path = folder / "synthetic.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
 
 
 def _numbers(seed: int | tuple[int, ...]) -> tuple[int, ...]:

@@ -3,13 +3,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import polars as pl
 import pytest
 
 from tensor_stereo.configs import SweepConfig, SyntheticConfig
-from tensor_stereo.datasets import build_manifest, write_manifest, write_pfm
-from tensor_stereo.datasets.synthetic import render_pair
+from tensor_stereo.datasets import build_manifest, write_manifest, write_synthetic
 from tensor_stereo.sweeps import read_grid, read_results
 
 SMALL = SyntheticConfig(width_px=160, height_px=120, min_disparity_px=3, max_disparity_px=20)
@@ -33,19 +31,8 @@ class Inputs(NamedTuple):
 
 
 def write_pairs(folder: Path, num_pairs: int) -> Path:
-    """Rendered pairs as PNG and PFM, and the list of them."""
-    folder.mkdir(exist_ok=True)
-    lines = ["image0,image1,disparity_gt"]
-    for k in range(num_pairs):
-        pair = render_pair((7, k), SMALL)
-        for view, image in enumerate((pair.image0, pair.image1)):
-            cv2.imwrite(str(folder / f"{k}-{view}.png"), image[0].numpy())
-        assert pair.disparity_gt is not None
-        write_pfm(folder / f"{k}.pfm", pair.disparity_gt.numpy())
-        lines.append(f"{k}-0.png,{k}-1.png,{k}.pfm")
-    path = folder / "pairs.csv"
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    """Small rendered pairs, and the list of them."""
+    return write_synthetic(folder, num_pairs, seed=7, config=SMALL)
 
 
 def make_manifest(pairs: Path) -> Path:

@@ -191,48 +191,49 @@ def _to_palette(path: Path) -> None:
     Image.fromarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)).convert("P").save(path)
 
 
-BAD = {
-    0: ("0-0.png", _truncate, "0-0.png"),
-    1: ("1-1.png", lambda path: path.write_bytes(b""), "1-1.png"),
-    2: ("2.pfm", lambda path: path.write_bytes(b"Px" + path.read_bytes()[2:]), "2.pfm"),
-    3: ("3.pfm", _truncate, "3.pfm"),
-    4: ("4-1.png", lambda path: path.unlink(), "4-1.png"),
-    5: ("5-0.png", lambda path: _rewrite(path, lambda image: image[:, :-1]), "5-0.png"),
+BAD: dict[str, Callable[[Path], object]] = {
+    "synthetic-00-0.png": _truncate,
+    "synthetic-01-1.png": lambda path: path.write_bytes(b""),
+    "synthetic-02.pfm": lambda path: path.write_bytes(b"Px" + path.read_bytes()[2:]),
+    "synthetic-03.pfm": _truncate,
+    "synthetic-04-1.png": lambda path: path.unlink(),
+    "synthetic-05-0.png": lambda path: _rewrite(path, lambda image: image[:, :-1]),
 }
 
 
 def test_damaged_files_are_errors_with_their_reason_and_odd_ones_are_read(tmp_path: Path) -> None:
     folder = tmp_path / "pairs"
     manifest = make_manifest(write_pairs(folder, 13))
-    wide = read_image(folder / "6-0.png")
-    for name, change, _ in BAD.values():
+    wide = read_image(folder / "synthetic-06-0.png")
+    for name, change in BAD.items():
         change(folder / name)
     for view in (0, 1):
-        _rewrite(folder / f"6-{view}.png", lambda image: image.astype(np.uint16) * 257)
-        _rewrite(folder / f"7-{view}.png", lambda image: np.dstack([image, image, image, np.full_like(image, 9)]))
-        _to_palette(folder / f"8-{view}.png")
-        _rewrite(folder / f"12-{view}.png", lambda image: image[:1, :1])
-    (folder / "9-0.png").rename(folder / "9-2.png")  # views swapped
-    (folder / "9-1.png").rename(folder / "9-0.png")
-    (folder / "9-2.png").rename(folder / "9-1.png")
-    write_pfm(folder / "10.pfm", np.full((120, 160), np.inf, np.float32))  # nothing is known
-    write_pfm(folder / "12.pfm", np.ones((1, 1), np.float32))
-    assert (read_image(folder / "6-0.png") == wide).all()
+        _rewrite(folder / f"synthetic-06-{view}.png", lambda image: image.astype(np.uint16) * 257)
+        _rewrite(folder / f"synthetic-07-{view}.png", lambda image: np.dstack([*[image] * 3, np.full_like(image, 9)]))
+        _to_palette(folder / f"synthetic-08-{view}.png")
+        _rewrite(folder / f"synthetic-12-{view}.png", lambda image: image[:1, :1])
+    left, right = folder / "synthetic-09-0.png", folder / "synthetic-09-1.png"
+    left.rename(folder / "other.png")
+    right.rename(left)
+    (folder / "other.png").rename(right)
+    write_pfm(folder / "synthetic-10.pfm", np.full((120, 160), np.inf, np.float32))  # nothing is known
+    write_pfm(folder / "synthetic-12.pfm", np.ones((1, 1), np.float32))
+    assert (read_image(folder / "synthetic-06-0.png") == wide).all()
     out = tmp_path / "run"
     summary = run_sweep(FAST, manifest, out, num_workers=2)
     assert summary.progress.num_done == 13
     errors = {row["scene"]: row for row in read_errors(out).iter_rows(named=True)}
-    assert errors.keys() == {f"{k}-0" for k in BAD}
-    for k, (_, _, word) in BAD.items():
-        assert word in errors[f"{k}-0"]["message"]
-        assert errors[f"{k}-0"]["stage"] == "read"
+    assert errors.keys() == {name[:12] for name in BAD}
+    for name in BAD:
+        assert name in errors[name[:12]]["message"]
+        assert errors[name[:12]]["stage"] == "read"
     rows = {row["scene"]: row for row in read_results(out).iter_rows(named=True)}
-    assert rows.keys() == {f"{k}-0" for k in range(6, 13)}
-    assert rows["9-0"]["fraction_incorrect"] > 0.9
-    assert rows["10-0"]["num_valid"] == 0
-    assert np.isnan(rows["10-0"]["sensitivity"])
-    assert rows["12-0"]["num_matches"] == 0
-    assert rows["6-0"]["num_matches"] == rows["6-0"]["num_valid"] > 0
+    assert rows.keys() == {f"synthetic-{k:02d}" for k in range(6, 13)}
+    assert rows["synthetic-09"]["fraction_incorrect"] > 0.9  # the views are swapped
+    assert rows["synthetic-10"]["num_valid"] == 0
+    assert np.isnan(rows["synthetic-10"]["sensitivity"])
+    assert rows["synthetic-12"]["num_matches"] == 0
+    assert rows["synthetic-06"]["num_matches"] == rows["synthetic-06"]["num_valid"] > 0
 
 
 @pytest.mark.slow

@@ -13,7 +13,15 @@ import torch
 import tensor_stereo as ts
 from tensor_stereo.cli import main
 from tensor_stereo.configs import SweepConfig
-from tensor_stereo.sweeps import SweepProgress, expand_grid, read_config, read_errors, read_matches, read_results, run_sweep
+from tensor_stereo.sweeps import (
+    SweepProgress,
+    expand_grid,
+    read_config,
+    read_errors,
+    read_matches,
+    read_results,
+    run_sweep,
+)
 from tests.sweeps.conftest import GRID, Inputs, assert_same, make_manifest, stored, write_pairs
 
 
@@ -76,13 +84,13 @@ def test_kept_matches_come_back_for_training(inputs: Inputs, tmp_path: Path) -> 
         assert found.score is not None
         assert torch.equal(found.score, ts.DelaunayFilter()(found.matches).score)
     with pytest.raises(ValueError, match="trial 7"):
-        read_matches(out, "pairs", "0-0", trial=7)
+        read_matches(out, "synthetic", "synthetic-00", trial=7)
 
 
 def test_a_run_without_matches_says_so(inputs: Inputs, tmp_path: Path) -> None:
     run_sweep(inputs.config, inputs.manifest, tmp_path / "run", num_workers=1, limit=1)
     with pytest.raises(ValueError, match="export_matches"):
-        read_matches(tmp_path / "run", "pairs", "0-0")
+        read_matches(tmp_path / "run", "synthetic", "synthetic-00")
 
 
 def test_a_bad_setting_is_told_before_anything_runs(inputs: Inputs, tmp_path: Path) -> None:
@@ -108,13 +116,13 @@ def test_the_command_runs_resumes_and_tells_failures_by_its_exit_code(
     assert "2 pairs x 8 points of the grid = 4 units" in printed
     assert "about 0:00:0" in printed
     assert not out.exists()
-    (tmp_path / "pairs" / "1-1.png").rename(tmp_path / "hidden.png")
+    (tmp_path / "pairs" / "synthetic-01-1.png").rename(tmp_path / "hidden.png")
     with pytest.raises(SystemExit) as stop:
         main(command)
     assert stop.value.code == 1
     assert "2 failed" in capsys.readouterr().out
     assert read_errors(out)["error"].to_list() == ["FileNotFoundError"] * 2
-    (tmp_path / "hidden.png").rename(tmp_path / "pairs" / "1-1.png")
+    (tmp_path / "hidden.png").rename(tmp_path / "pairs" / "synthetic-01-1.png")
     with pytest.raises(SystemExit):
         main(command)  # a failed unit is done
     main([*command, "--retry-errors"])

@@ -8,12 +8,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Render, Report, Sweep
+from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Classify, tyro.conf.subcommand("classify")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Filter, tyro.conf.subcommand("filter")]
+    | Annotated[Download, tyro.conf.subcommand("download")]
     | Annotated[Index, tyro.conf.subcommand("index")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Report, tyro.conf.subcommand("report")]

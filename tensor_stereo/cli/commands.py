@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from tensor_stereo.configs import EvaluationConfig, PipelineConfig
+from tensor_stereo.configs import ClassifyConfig, EvaluationConfig, PipelineConfig
 
 Flat = tyro.conf.arg(name="")
 
@@ -59,6 +59,33 @@ class Evaluate:
     out: Path | None = None
     """Folder for summary.json, settings.json, the tables and one figure per scene and detector."""
     config: Annotated[EvaluationConfig, Flat] = field(default_factory=EvaluationConfig)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Decide which matches of a file are right, and write the file again with verdict and score."""
+
+    matches: tyro.conf.Positional[Path]
+    """Putative matches: .npz, .csv, .parquet, hloc's .h5, COLMAP's .db."""
+    out: Path
+    """File to write, with the same ending."""
+    keypoints: Path | None = None
+    """hloc's file of features, for .h5."""
+    threshold: float | None = None
+    """Verdict by score instead of by restriction."""
+    config: Annotated[ClassifyConfig, Flat] = field(default_factory=ClassifyConfig)
+
+
+@dataclass(frozen=True)
+class Download:
+    """Fetch published stereo releases and unpack them; a broken download goes on where it stopped."""
+
+    releases: tyro.conf.Positional[tuple[str, ...]]
+    """Names such as middlebury-2005; a wrong one lists them all."""
+    out: Path = Path("data")
+    """Folder for all of them."""
+    base_url: str | None = None
+    """Mirror, which replaces scheme and host of every address."""
 
 
 @dataclass(frozen=True)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Evaluate, Index, Render, Report, Sweep
+from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.cli.download import run_download_command
 from tensor_stereo.cli.sweep import run_sweep_command
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
 from tensor_stereo.datasets.synthetic import SyntheticDataset, write_synthetic
 from tensor_stereo.evaluation import PairEvaluation, evaluate_dataset
+from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.reports.evaluation import write_evaluation
 from tensor_stereo.reports.matches import classify_files
 from tensor_stereo.reports.sweep.report import write_report
@@ -23,23 +26,11 @@ from tensor_stereo.reports.sweep.runs import load_run
 from tensor_stereo.reports.tables import Table, to_markdown
 
 
-def run(command: Demo | Classify | Evaluate | Index | Render | Report | Sweep) -> int:
-    """Dispatch a parsed command; its exit code."""
-    match command:
-        case Demo():
-            _run_demo(command)
-        case Classify():
-            _run_classify(command)
-        case Evaluate():
-            _run_evaluate(command)
-        case Index():
-            _run_index(command)
-        case Render():
-            print(write_synthetic(command.out, command.num_pairs, seed=command.seed))
-        case Report():
-            _run_report(command)
-        case Sweep():
-            return run_sweep_command(command)
+def run(command: Any) -> int:
+    """Carry out a parsed command; its exit code."""
+    if isinstance(command, Sweep):
+        return run_sweep_command(command)
+    _RUNNERS[type(command)](command)
     return 0
 
 
@@ -70,6 +61,18 @@ def _run_index(command: Index) -> None:
     for dataset, count in sorted(Counter(manifest["dataset"]).items()):
         print(f"{dataset}: {count} pairs")
     print(f"{len(manifest)} pairs in {command.out}")
+
+
+def _run_filter(command: Filter) -> None:
+    summary = filter_file(
+        command.matches, command.out, keypoints=command.keypoints, config=command.config, threshold=command.threshold
+    )
+    for name, value in asdict(summary).items():
+        print(f"{name:20}{value:8}")
+
+
+def _run_render(command: Render) -> None:
+    print(write_synthetic(command.out, command.num_pairs, seed=command.seed))
 
 
 def _run_report(command: Report) -> None:
@@ -115,3 +118,15 @@ def _print_tables(tables: Iterable[Table]) -> None:
         for row in table.text_rows():
             view.add_row(*row)
         console.print(view)
+
+
+_RUNNERS: dict[type, Callable[[Any], None]] = {
+    Demo: _run_demo,
+    Classify: _run_classify,
+    Evaluate: _run_evaluate,
+    Filter: _run_filter,
+    Download: run_download_command,
+    Index: _run_index,
+    Render: _run_render,
+    Report: _run_report,
+}

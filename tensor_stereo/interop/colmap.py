@@ -1,0 +1,157 @@
+"""Databases of COLMAP: matches as pairs of rows of the keypoints of two images.
+
+COLMAP counts pixel corners, not centres, as integers: its keypoints are half a pixel larger than those of this library.
+No verdict depends on a shift, and no keypoint is written, so they are taken as they are.
+
+The tables are read with SQLite, not by ``pycolmap.Database``: opening one brings its file to the installed version's
+schema, and reading believes the number of rows before it looks at the data.
+
+Source: COLMAP's documentation, "Database Format".
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from tensor_stereo.interop.verdicts import (
+    MAX_ROWS,
+    Array,
+    FilterSummary,
+    MatchFilter,
+    Verdicts,
+    filter_each,
+    pair_matches,
+)
+from tensor_stereo.types import Matches
+
+TABLE = "tensor_stereo_verdicts"
+_CREATE = f"""CREATE TABLE {TABLE} (
+    pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
+    inlier BLOB, score BLOB, relation BLOB)"""
+_KEYS = {"matches": "pair_id", "keypoints": "image_id"}
+_FULL = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
+
+
+def filter_colmap(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
+    """Copy a database with only the inliers in its table ``matches``.
+
+    Every pair of that table goes through the filter; matches have no cost. The table ``tensor_stereo_verdicts`` of the
+    copy holds all putative matches: ``pair_id, rows, cols, data`` as ``matches`` had them, and of ``rows`` values each
+    the blobs ``inlier`` uint8, ``score`` float32 and ``relation`` int8. The rows of ``two_view_geometries`` whose pair
+    loses matches are removed, since they were estimated from those too: run COLMAP's geometric verification again.
+
+    Raises:
+        ValueError: if the database is damaged, unfinished or no such; the message names file, table and pair.
+        OSError: if the copy cannot be written.
+        ImportError: if pycolmap is not installed.
+    """
+    wal = source.with_name(f"{source.name}-wal")
+    if wal.is_file() and wal.stat().st_size:
+        raise ValueError(f"{source} is not finished, part of it is in {wal.name}: close the program that writes it")
+    shutil.copyfile(source, target)
+    try:
+        with closing(sqlite3.connect(target, isolation_level=None)) as database:
+            summary = _filter_copy(source, database, run)
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # a message of SQLite may cite bytes that are no text
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _FULL:  # the primary code
+            raise OSError(f"the copy of {source} cannot be written: {error}") from error
+        raise ValueError(f"{source} is no readable COLMAP database: {error}") from error
+    finally:
+        for ending in ("-journal", "-wal", "-shm"):
+            target.with_name(target.name + ending).unlink(missing_ok=True)
+    return summary
+
+
+def _filter_copy(source: Path, database: sqlite3.Connection, run: MatchFilter) -> FilterSummary:
+    database.text_factory = lambda text: text.decode(errors="replace")
+    database.execute("PRAGMA trusted_schema = OFF")
+    _check_schema(source, database)
+    database.execute("PRAGMA journal_mode = MEMORY")  # one file; COLMAP's own mode leaves two more beside it
+    database.execute("BEGIN")
+    database.execute(f"DROP TABLE IF EXISTS {TABLE}")  # of an earlier filter
+    database.execute(_CREATE)
+    has_geometries = "two_view_geometries" in _tables(database)
+    summary = FilterSummary()
+    for pair_id, verdicts in filter_each(_read_pairs(source, database), run):
+        _write_verdicts(database, pair_id, verdicts)
+        if has_geometries and not verdicts.inlier.all():
+            database.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id,))
+        summary = summary.add(1, verdicts)
+    database.execute("COMMIT")
+    return summary
+
+
+def _tables(database: sqlite3.Connection) -> dict[str, str]:
+    return dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+
+
+def _check_schema(source: Path, database: sqlite3.Connection) -> None:
+    """Raise unless both tables are plain ones, and nothing runs when they change."""
+    tables = _tables(database)
+    for name, key in _KEYS.items():
+        if not (tables.get(name) or "").upper().startswith("CREATE TABLE"):
+            raise ValueError(f"{source} has no table {name!r}, it has {sorted(tables)}")
+        columns = {row[1] for row in database.execute(f"PRAGMA table_xinfo({name})")}
+        missing = {key, "rows", "cols", "data"} - columns
+        if missing:
+            raise ValueError(f"{source}: table {name!r} has no column {min(missing)!r}, it has {sorted(columns)}")
+    triggers = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'")]
+    if triggers:
+        raise ValueError(f"{source} must have no triggers, which COLMAP does not write, got {triggers}")
+
+
+def _read_pairs(source: Path, database: sqlite3.Connection) -> Iterator[tuple[int, Matches]]:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError(f"pycolmap must be installed to read {source.name}") from error
+    for (pair_id,) in database.execute("SELECT pair_id FROM matches ORDER BY pair_id").fetchall():
+        place = f"{source}, pair_id {pair_id!r}"
+        if not isinstance(pair_id, int) or pair_id < 0:
+            raise ValueError(f"{place} must be a number that COLMAP gives to two images")
+        image1, image2 = pycolmap.pair_id_to_image_pair(pair_id)
+        place = f"{place} (images {image1} and {image2})"
+        rows = _read_blob(place, database, "matches", pair_id, "<u4")
+        if rows.shape[1] != 2:
+            raise ValueError(f"{place}: table 'matches' must have 2 cols, got {rows.shape[1]}")
+        points0, points1 = (_read_blob(place, database, "keypoints", image, "<f4") for image in (image1, image2))
+        for view, points in enumerate((points0, points1)):
+            if len(points) and points.shape[1] < 2:
+                raise ValueError(f"{place}: table 'keypoints' must have 2 or more cols, got {points.shape[1]}")
+            if len(rows) and rows[:, view].max() >= len(points):
+                row, given = int(rows[:, view].argmax()), rows[:, view].max()
+                known = f"there are {len(points)} keypoints"
+                raise ValueError(f"{place}: row {row} of the matches names keypoint {given} of view {view}, {known}")
+        rows0, rows1 = rows.astype(np.int64).T
+        yield pair_id, pair_matches(place, points0[:, :2], points1[:, :2], rows0, rows1)
+
+
+def _read_blob(place: str, database: sqlite3.Connection, table: str, key: int, dtype: str) -> Array:
+    """The (rows, cols) array of one row of a table, whose size is checked before its data is read."""
+    where = f"FROM {table} WHERE {_KEYS[table]} = ?"
+    found = database.execute(f"SELECT rows, cols, ifnull(length(data), 0), typeof(data) {where}", (key,)).fetchone()
+    if found is None:
+        raise ValueError(f"{place}: table {table!r} has no row for {_KEYS[table]} {key}")
+    rows, cols, num_bytes, kind = found
+    if not all(isinstance(value, int) and 0 <= value <= MAX_ROWS for value in (rows, cols)):
+        raise ValueError(f"{place}: table {table!r} must have 0..{MAX_ROWS} rows and cols, got {rows!r} and {cols!r}")
+    if kind not in ("blob", "null") or num_bytes != rows * cols * 4:
+        raise ValueError(f"{place}: table {table!r} claims {rows} x {cols} values of 4 bytes, its data has {num_bytes}")
+    (data,) = database.execute(f"SELECT data {where}", (key,)).fetchone()
+    array: Array = np.frombuffer(data or b"", dtype=dtype).reshape(rows, cols)
+    return array
+
+
+def _write_verdicts(database: sqlite3.Connection, pair_id: int, verdicts: Verdicts) -> None:
+    copied = f"INSERT INTO {TABLE} SELECT pair_id, rows, cols, data, ?, ?, ? FROM matches WHERE pair_id = ?"
+    blobs = verdicts.inlier.tobytes(), verdicts.score.astype("<f4").tobytes(), verdicts.relation.tobytes()
+    database.execute(copied, (*blobs, pair_id))
+    rows = _read_blob(f"pair_id {pair_id}", database, "matches", pair_id, "<u4")[verdicts.inlier]
+    changed = "UPDATE matches SET rows = ?, data = ? WHERE pair_id = ?"
+    database.execute(changed, (len(rows), rows.tobytes(), pair_id))

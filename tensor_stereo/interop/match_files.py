@@ -1,0 +1,112 @@
+"""Files of putative matches: one function reads them, filters them and writes the same format with the verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+from tensor_stereo.atomic import whole_file
+from tensor_stereo.configs import ClassifyConfig
+from tensor_stereo.interop.colmap import filter_colmap
+from tensor_stereo.interop.hloc import filter_hloc
+from tensor_stereo.interop.match_tables import filter_table
+from tensor_stereo.interop.npz import filter_npz
+from tensor_stereo.interop.verdicts import FilterSummary
+from tensor_stereo.modules import DelaunayFilter
+
+# Ending -> first bytes of such a file, and what it is called.
+_FORMATS = {
+    ".npz": (b"PK", "NumPy archive"),
+    ".csv": (b"", "CSV file"),
+    ".parquet": (b"PAR1", "Parquet file"),
+    ".h5": (b"\x89HDF\r\n\x1a\n", "HDF5 file"),
+    ".db": (b"SQLite format 3\0", "SQLite database"),
+}
+
+
+def filter_file(
+    source: Path,
+    out: Path,
+    *,
+    keypoints: Path | None = None,
+    config: ClassifyConfig | None = None,
+    threshold: float | None = None,
+) -> FilterSummary:
+    r"""Decide which matches of a file are right, and write the file again with verdict and score.
+
+    The format is that of the ending, and the same for both files:
+
+    ============  ==================================================================================================
+    ``.npz``      arrays of rows, or of LightGlue and glue-factory: :func:`~tensor_stereo.interop.npz.filter_npz`
+    ``.csv``      a row per match: :func:`~tensor_stereo.interop.match_tables.filter_table`
+    ``.parquet``  the same
+    ``.h5``       matches of hloc, with ``keypoints``: :func:`~tensor_stereo.interop.hloc.filter_hloc`
+    ``.db``       database of COLMAP: :func:`~tensor_stereo.interop.colmap.filter_colmap`
+    ============  ==================================================================================================
+
+    Verdict and score are those of :class:`~tensor_stereo.DelaunayFilter` on all pairs as one batch, in blocks of
+    bounded size, with coordinates in float64. Pairs with few or no matches are UNTESTED. Files are data only: nothing
+    in them is run, unpickled or taken for a path, and no size in them is believed before it is checked.
+
+    Args:
+        source: file of putative matches. It is not changed.
+        out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced.
+        keypoints: hloc's file of features; for ``.h5`` only.
+        config: settings of the verdict; None is ``ClassifyConfig()``.
+        threshold: verdict by score >= threshold instead of by the restriction.
+
+    Returns:
+        Counts of pairs and matches.
+
+    Raises:
+        ValueError: if a file is damaged or a value in it is wrong (naming file, pair and row or column), the ending is
+            none of these, or ``out`` is the same file as ``source`` or ``keypoints``.
+        FileNotFoundError: if a file or the folder of ``out`` is missing.
+        OSError: if ``out`` cannot be written.
+        ImportError: if h5py (``.h5``) or pycolmap (``.db``) is needed and not installed.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     source, out = Path(folder, "matches.csv"), Path(folder, "filtered.csv")
+        ...     _ = source.write_text("x0,y0,x1,y1\n0,0,-3,0\n9,1,6,1\n1,8,-2,8\n8,9,5,9\n")
+        ...     filter_file(source, out).num_kept, out.read_text().splitlines()[:2]
+        (4, ['x0,y0,x1,y1,inlier,score,relation', '0,0,-3,0,true,1.0,equal'])
+    """
+    ending = _check_files(source, out, keypoints)
+    config = ClassifyConfig() if config is None else config
+    settings = {field.name: getattr(config, field.name) for field in fields(ClassifyConfig)}
+    run = DelaunayFilter(**settings, threshold=threshold)
+    with whole_file(out) as target:
+        if ending == ".npz":
+            return filter_npz(source, target, run)
+        if ending == ".db":
+            return filter_colmap(source, target, run)
+        if keypoints is not None:
+            return filter_hloc(source, target, run, keypoints)
+        return filter_table(source, target, run)
+
+
+def _check_files(source: Path, out: Path, keypoints: Path | None) -> str:
+    """The ending, after a look at all three files."""
+    ending = source.suffix.casefold()
+    if ending not in _FORMATS:
+        raise ValueError(f"source must end in {', '.join(_FORMATS)}, got {source.name!r}")
+    if out.suffix.casefold() != ending:
+        raise ValueError(f"out must end in {ending} as source does, got {out.name!r}")
+    if (keypoints is not None) != (ending == ".h5"):
+        raise ValueError(f"keypoints must be given for .h5, and only for it, got {keypoints} for {source.name!r}")
+    for name, path, kind in (("source", source, ending), ("keypoints", keypoints, ".h5")):
+        if path is None:
+            continue
+        if not path.is_file():
+            raise FileNotFoundError(f"{name}: there is no file {path}")
+        if path.resolve() == out.resolve() or (out.exists() and out.samefile(path)):
+            raise ValueError(f"out must be another file than {name}, got {out} for both")
+        first, called = _FORMATS[kind]
+        with path.open("rb") as file:
+            if file.read(len(first)) != first:
+                raise ValueError(f"{path} is no {called}, whatever its ending says")
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"out: there is no folder {out.parent}")
+    return ending

@@ -1,0 +1,160 @@
+"""Tables of matches, CSV and Parquet: one row per match of one or many pairs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import torch
+
+from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.interop.verdicts import (
+    MAX_ROWS,
+    Array,
+    FilterSummary,
+    Int,
+    MatchFilter,
+    check_keypoints,
+    filter_matches,
+)
+from tensor_stereo.types import Matches, Relation
+
+_POINTS = ("x0", "y0", "x1", "y1")
+# Polars would inflate such a file, whatever its ending says, and to any size: gzip, zlib, Zstandard.
+_COMPRESSED = (b"\x1f\x8b", b"x\x01", b"x\x9c", b"x\xda", b"\x28\xb5\x2f\xfd")
+# Prints the number of rows that the file claims, then decodes it all.
+_DECODE = "import polars, sys; f = polars.scan_parquet(sys.argv[1], glob=False); n = f.select(polars.len()).collect()"
+_DECODE += "; print(n.item(), flush=True); n.item() > int(sys.argv[2]) or f.collect()"
+
+
+def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
+    """Copy a table and add ``inlier``, ``score`` and ``relation``, by name in lower case.
+
+    Columns: ``x0, y0, x1, y1`` in px, and optionally ``pair``, a string or an integer that names the pair of a row,
+    whose rows need not be adjacent; ``cost``, lower is better; ``group``, integer. All rows and columns are kept, in
+    order; columns with the names of the results are replaced. What ``tensor-stereo classify --out`` writes is such a
+    table of one pair.
+
+    Raises:
+        ValueError: if the file is damaged or a column or value is wrong; the message names file, row (from 0), column.
+        OSError: if the copy cannot be written.
+    """
+    table = _read_csv(source) if source.suffix.casefold() == ".csv" else _read_parquet(source)
+    for name in _POINTS:
+        if name not in table.columns:
+            raise ValueError(f"{source} has no column {name!r}, it has {table.columns}")
+    pair = _pair_numbers(source, table)
+    order = np.argsort(pair, kind="stable")  # whole pairs, their rows in the order of the file
+    verdicts = filter_matches(_to_matches(source, table, pair, order), run)
+    verdicts = verdicts.take(np.argsort(order, kind="stable"))
+    names = {relation.value: relation.name.lower() for relation in Relation}
+    table = table.with_columns(
+        pl.Series("inlier", verdicts.inlier),
+        pl.Series("score", verdicts.score),
+        pl.Series("relation", verdicts.relation).replace_strict(names, return_dtype=pl.String),
+    )
+    try:
+        table.write_csv(target) if source.suffix.casefold() == ".csv" else table.write_parquet(target)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:  # where there is no room
+        raise OSError(f"the copy of {source} cannot be written: {error}") from error
+    return FilterSummary().add(int(pair.max(initial=-1)) + 1, verdicts)
+
+
+def _read_csv(source: Path) -> pl.DataFrame:
+    """All columns as text, so that those which are carried through stay as they are."""
+    with source.open("rb") as file:
+        if file.read(4).startswith(_COMPRESSED):
+            raise ValueError(f"{source} is compressed, not a CSV file; unpack it first")
+    try:
+        header = pl.read_csv(source, glob=False, has_header=False, n_rows=1, infer_schema=False).row(0)
+        table = pl.read_csv(source, glob=False, infer_schema=False)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        raise ValueError(f"{source} is no readable CSV file: {error}") from error
+    if len(set(header)) < len(header):
+        twice = next(name for name in header if header.count(name) > 1)
+        raise ValueError(f"{source} has the column {twice!r} twice")
+    _check_num_rows(source, len(table))
+    return table
+
+
+def _read_parquet(source: Path) -> pl.DataFrame:
+    # Damaged Parquet can end the process: Polars believes lengths in the data and allocates them. So it is decoded in
+    # a process of its own first.
+    command = [sys.executable, "-P", "-c", _DECODE, str(source), str(MAX_ROWS)]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    if done.stdout:
+        _check_num_rows(source, int(done.stdout))
+    if done.returncode:
+        reasons = re.findall(r"^\S+(?:Error|Exception): (.+)", done.stderr, re.MULTILINE)
+        raise ValueError(f"{source} is no readable Parquet file: {reasons[-1] if reasons else 'it ends the decoder'}")
+    return pl.read_parquet(source, glob=False)
+
+
+def _check_num_rows(source: Path, num_rows: int) -> None:
+    if num_rows > MAX_ROWS:
+        raise ValueError(f"{source} must have at most {MAX_ROWS} rows, got {num_rows}")
+
+
+def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
+    """(M,) number of the pair of each row, in any order without gaps."""
+    if "pair" not in table.columns:
+        return np.zeros(len(table), dtype=np.int64)
+    pair = table["pair"]
+    if not (pair.dtype.is_integer() or pair.dtype in (pl.String, pl.Categorical, pl.Enum)):
+        raise ValueError(f"{source}: column 'pair' must hold strings or integers, got {pair.dtype}")
+    if pair.has_nulls():
+        raise ValueError(f"{source}, row {pair.is_null().arg_max()}: column 'pair' is empty")
+    if not pair.dtype.is_integer():
+        pair = pair.cast(pl.String)
+    numbers: Int = pair.rank("dense").to_numpy().astype(np.int64) - 1
+    return numbers
+
+
+def _to_matches(
+    source: Path,
+    table: pl.DataFrame,
+    pair: Int,
+    order: Int,
+) -> Matches:
+    """The checked matches, row k of them being row ``order[k]`` of the table."""
+    x0, y0, x1, y1 = (_numbers(source, table, name, pl.Float64) for name in _POINTS)
+    views = np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
+    for names, points in zip(("x0, y0", "x1, y1"), views, strict=True):
+        check_keypoints(points, lambda row, names=names: f"{_place(source, table, row)}: ({names})")  # type: ignore[misc]
+    cost = group = None
+    if "cost" in table.columns:
+        values = _numbers(source, table, "cost", pl.Float64)
+        if np.isnan(values).any():
+            row = int(np.isnan(values).argmax())
+            raise ValueError(f"{_place(source, table, row)}: column 'cost' must not be NaN")
+        cost = torch.from_numpy(values[order])
+    if "group" in table.columns:
+        group = torch.from_numpy(_numbers(source, table, "group", pl.Int64)[order])
+    ptr = lengths_to_ptr(torch.from_numpy(np.bincount(pair, minlength=1)))
+    left, right = (torch.from_numpy(points[order]) for points in views)
+    return Matches(left, right, ptr, cost, group)
+
+
+def _numbers(source: Path, table: pl.DataFrame, name: str, dtype: type[pl.DataType]) -> Array:
+    """A column as numbers; raises for the first row that holds none."""
+    column = table[name]
+    noun = "an integer" if dtype == pl.Int64 else "a number"
+    if column.dtype == pl.String:
+        values = column.str.strip_chars().cast(dtype, strict=False)
+    elif column.dtype.is_integer() or (column.dtype.is_numeric() and dtype == pl.Float64):
+        values = column.cast(dtype, strict=False)
+    else:
+        raise ValueError(f"{source}: column {name!r} must hold {noun} per row, got {column.dtype}")
+    if values.has_nulls():
+        row = values.is_null().arg_max() or 0
+        place = f"{_place(source, table, row)}: column {name!r}"
+        raise ValueError(f"{place} must be {noun}, got {column[row]!r}" if column[row] else f"{place} is empty")
+    return values.to_numpy()
+
+
+def _place(source: Path, table: pl.DataFrame, row: int) -> str:
+    return f"{source}, row {row}" + (f" (pair {table['pair'][row]!r})" if "pair" in table.columns else "")

@@ -1,0 +1,194 @@
+"""Matches from files through the filter: blocks of bounded size, and checks that name the place of what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tensor_stereo.batching import collate_matches, select_pairs
+from tensor_stereo.filters import FilterOutput
+from tensor_stereo.ops.segments import LARGEST, SMALLEST
+from tensor_stereo.types import Matches, Relation
+
+Array = NDArray[Any]
+Int = NDArray[np.int64]
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Int8 = NDArray[np.int8]
+Key = TypeVar("Key")
+MatchFilter: TypeAlias = Callable[[Matches], FilterOutput]
+
+BLOCK_MATCHES = 1 << 17  # about 200 MB while the filter runs
+MAX_ROWS = 1 << 26  # matches of a table, keypoints of an image: 1 GB of coordinates a view
+
+
+@dataclass(frozen=True)
+class FilterSummary:
+    """Counts over the putative matches of a file."""
+
+    num_pairs: int = 0
+    num_matches: int = 0
+    num_kept: int = 0
+    num_rejected: int = 0
+    num_untested: int = 0
+
+    def add(self, num_pairs: int, verdicts: Verdicts) -> FilterSummary:
+        """The counts with those of ``num_pairs`` more pairs."""
+        num_matches, num_kept = len(verdicts.inlier), int(verdicts.inlier.sum())
+        num_untested = int((verdicts.relation == Relation.UNTESTED).sum())
+        return FilterSummary(
+            self.num_pairs + num_pairs,
+            self.num_matches + num_matches,
+            self.num_kept + num_kept,
+            self.num_rejected + num_matches - num_kept - num_untested,
+            self.num_untested + num_untested,
+        )
+
+
+class Verdicts(NamedTuple):
+    """Verdict on every match."""
+
+    inlier: Bool  # (M,)
+    score: Float  # (M,) in [0, 1], higher is better, 0 for untested matches
+    relation: Int8  # (M,) values of Relation
+
+    def spread(self, mask: Bool) -> Verdicts:
+        """The same at the M True places of ``mask`` (N,); no inlier, 0 and UNTESTED elsewhere."""
+        num_rows = len(mask)
+        inlier, score, relation = np.zeros(num_rows, np.bool_), np.zeros(num_rows), np.zeros(num_rows, np.int8)
+        inlier[mask], score[mask], relation[mask] = self
+        return Verdicts(inlier, score, relation)
+
+    def take(self, rows: Int) -> Verdicts:
+        """The verdicts of ``rows``, in their order."""
+        return Verdicts(self.inlier[rows], self.score[rows], self.relation[rows])
+
+
+def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
+    """Run a filter over a batch, in blocks of whole pairs with about ``BLOCK_MATCHES`` matches.
+
+    Args:
+        matches: B pairs on the CPU.
+        run: takes Matches, returns a FilterOutput; pairs must not depend on each other.
+
+    Example:
+        >>> from tensor_stereo import DelaunayFilter
+        >>> points = torch.tensor([[0.0, 0.0], [9.0, 1.0], [1.0, 8.0], [8.0, 9.0]])
+        >>> filter_matches(Matches(points, points - 1, torch.tensor([0, 4])), DelaunayFilter()).inlier
+        array([ True,  True,  True,  True])
+    """
+    ptr = matches.ptr.numpy()
+    parts = [Verdicts(np.zeros(0, np.bool_), np.zeros(0), np.zeros(0, np.int8))]
+    start = 0
+    while start < matches.num_pairs:
+        fitting = int(np.searchsorted(ptr, ptr[start] + BLOCK_MATCHES, side="right")) - 1
+        stop = max(fitting, start + 1)  # a pair is never cut
+        output = run(select_pairs(matches, start, stop))
+        score = output.score.detach().double()
+        parts.append(Verdicts(output.inlier.numpy(), score.numpy(), output.relation.numpy()))
+        start = stop
+    return Verdicts(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def filter_each(items: Iterable[tuple[Key, Matches]], run: MatchFilter) -> Iterator[tuple[Key, Verdicts]]:
+    """Run a filter over a stream of pairs, as many at once as :func:`filter_matches` takes in one block.
+
+    Args:
+        items: what names a pair, and its matches; some pairs may have a cost and others none.
+        run: as for :func:`filter_matches`.
+
+    Yields:
+        Every key with its verdicts, in order.
+    """
+    block: list[tuple[Key, Matches]] = []
+    num_matches = 0
+    for key, matches in items:
+        is_full = num_matches + matches.num_matches > BLOCK_MATCHES
+        if block and (is_full or (matches.cost is None) != (block[0][1].cost is None)):
+            yield from _filter_block(block, run)
+            block, num_matches = [], 0
+        block.append((key, matches))
+        num_matches += max(matches.num_matches, 1)  # empty pairs take memory too
+    if block:
+        yield from _filter_block(block, run)
+
+
+def _filter_block(block: list[tuple[Key, Matches]], run: MatchFilter) -> Iterator[tuple[Key, Verdicts]]:
+    verdicts = filter_matches(collate_matches([matches for _, matches in block]), run)
+    cuts = np.cumsum([matches.num_matches for _, matches in block])[:-1]
+    columns = (np.split(values, cuts) for values in verdicts)
+    for (key, _), inlier, score, relation in zip(block, *columns, strict=True):
+        yield key, Verdicts(inlier, score, relation)
+
+
+def check_keypoints(points: Float, describe: Callable[[int], str]) -> None:
+    """Raise unless all of (M, 2) ``points`` can be triangulated; ``describe`` names the keypoint of a row.
+
+    >>> check_keypoints(np.array([[0.0, np.inf]]), lambda row: f"m.csv, row {row}: keypoint 0")
+    Traceback (most recent call last):
+    ...
+    ValueError: m.csv, row 0: keypoint 0 must be finite, 0 or 1e-60..1e+60 in magnitude, got (0.0, inf)
+    """
+    magnitude = np.abs(points)
+    good = ((magnitude == 0) | ((magnitude >= SMALLEST) & (magnitude <= LARGEST))).all(axis=1)
+    if not good.all():
+        row = int(good.argmin())
+        limits = f"0 or {SMALLEST:g}..{LARGEST:g} in magnitude"
+        raise ValueError(f"{describe(row)} must be finite, {limits}, got {tuple(points[row].tolist())}")
+
+
+def pick_matches(place: str, keypoints0: Array, keypoints1: Array, matches0: Array, scores0: Array | None) -> Matches:
+    """One pair's matches from the partner of each keypoint, in the order of view 0.
+
+    Args:
+        place: file and pair, for errors.
+        keypoints0: (N0, 2), (x, y) in px.
+        keypoints1: (N1, 2).
+        matches0: at most (N0,) integers: a row of ``keypoints1``, -1 for none, -2 for "ignore".
+        scores0: as ``matches0``, higher is better; the cost is 1 - score.
+
+    Raises:
+        ValueError: if a partner does not exist, a matched keypoint is not finite or a score is NaN.
+
+    >>> points = np.eye(2)
+    >>> pick_matches("m.npz", points, points, np.array([-1, 0]), None).keypoints1
+    tensor([[1., 0.]], dtype=torch.float64)
+    """
+    if len(matches0) > len(keypoints0):
+        raise ValueError(f"{place}: matches0 has {len(matches0)} rows, but there are {len(keypoints0)} keypoints0")
+    partner = matches0.astype(np.int64)
+    wrong = (partner < -2) | (partner >= len(keypoints1))
+    if wrong.any():
+        row = int(wrong.argmax())
+        known = f"one of {len(keypoints1)} keypoints1"
+        raise ValueError(f"{place}: matches0 must be -1, -2 or {known}, got {partner[row]} in row {row}")
+    rows0 = np.flatnonzero(partner >= 0)
+    rows1 = partner[rows0]
+    cost = None
+    if scores0 is not None:
+        cost = 1 - scores0[rows0].astype(np.float64)
+        if np.isnan(cost).any():
+            raise ValueError(f"{place}: matching_scores0 must not be NaN, got NaN in row {rows0[np.isnan(cost)][0]}")
+    return pair_matches(place, keypoints0, keypoints1, rows0, rows1, cost)
+
+
+def pair_matches(
+    place: str,
+    keypoints0: Array,
+    keypoints1: Array,
+    rows0: Int,
+    rows1: Int,
+    cost: Float | None = None,
+) -> Matches:
+    """One pair's matches from existing rows of both views; raises as :func:`pick_matches`."""
+    views = keypoints0[rows0].astype(np.float64), keypoints1[rows1].astype(np.float64)
+    for name, points, rows in zip(("keypoints0", "keypoints1"), views, (rows0, rows1), strict=True):
+        check_keypoints(points, lambda k, name=name, rows=rows: f"{place}: {name}, row {rows[k]},")  # type: ignore[misc]
+    ptr = torch.tensor([0, len(rows0)])
+    left, right = (torch.from_numpy(points) for points in views)
+    return Matches(left, right, ptr, None if cost is None else torch.from_numpy(cost))

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tensor_stereo import DelaunayFilter, Matches
+from tensor_stereo.batching import collate_matches, split_matches
+from tensor_stereo.filters import FilterOutput
+from tensor_stereo.interop import verdicts
+from tensor_stereo.interop.glue_factory import from_glue_factory
+from tensor_stereo.interop.verdicts import FilterSummary, Verdicts, filter_each, filter_matches, pick_matches
+from tests.interop.match_batches import batch, expected
+
+sizes = st.lists(st.integers(0, 30), max_size=8)
+seeds = st.integers(0, 10**6)
+
+
+def assert_same(a: Verdicts, b: Verdicts) -> None:
+    for name, one, other in zip(Verdicts._fields, a, b, strict=True):
+        assert one.dtype == other.dtype, name
+        np.testing.assert_array_equal(one, other, err_msg=name)
+
+
+class Recorder:
+    """DelaunayFilter that remembers what it was given."""
+
+    def __init__(self) -> None:
+        self.seen: list[Matches] = []
+
+    def __call__(self, matches: Matches) -> FilterOutput:
+        self.seen.append(matches)
+        return DelaunayFilter()(matches)
+
+
+@given(seeds, sizes, st.integers(1, 70))
+def test_blocks_hold_whole_pairs_and_change_nothing(seed: int, lengths: list[int], block: int) -> None:
+    matches = batch(seed, lengths) if lengths else batch(seed, [5])
+    recorder = Recorder()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdicts, "BLOCK_MATCHES", block)
+        assert_same(filter_matches(matches, recorder), expected(matches))
+    assert [n for part in recorder.seen for n in part.ptr.diff().tolist()] == matches.ptr.diff().tolist()
+    assert all(part.num_matches <= block or part.num_pairs == 1 for part in recorder.seen)
+
+
+def test_everything_that_fits_runs_at_once() -> None:
+    recorder = Recorder()
+    filter_matches(batch(0), recorder)
+    assert [part.num_pairs for part in recorder.seen] == [5]
+
+
+def test_a_batch_without_pairs_has_no_verdicts() -> None:
+    empty = Matches(torch.zeros(0, 2), torch.zeros(0, 2), torch.tensor([0]))
+    assert [len(values) for values in filter_matches(empty, DelaunayFilter())] == [0, 0, 0]
+    assert list(filter_each([], DelaunayFilter())) == []
+
+
+@given(seeds, sizes, st.integers(1, 70), st.sets(st.integers(0, 7)))
+def test_a_stream_gets_the_verdicts_of_each_pair_alone(
+    seed: int, lengths: list[int], block: int, without_cost: set[int]
+) -> None:
+    items = split_matches(batch(seed, lengths)) if lengths else []
+    items = [replace(item, cost=None) if b in without_cost else item for b, item in enumerate(items)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdicts, "BLOCK_MATCHES", block)
+        results = list(filter_each(enumerate(items), DelaunayFilter()))
+    assert [key for key, _ in results] == list(range(len(items)))
+    for (_, result), item in zip(results, items, strict=True):
+        assert_same(result, expected(item))
+
+
+def test_a_stream_is_read_no_further_than_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verdicts, "BLOCK_MATCHES", 40)
+    taken: list[int] = []
+
+    def pairs() -> object:
+        for b, item in enumerate(split_matches(batch(0, [15] * 9))):
+            taken.append(b)
+            yield b, item
+
+    stream = filter_each(pairs(), DelaunayFilter())  # type: ignore[arg-type]
+    next(stream)
+    assert taken == [0, 1, 2]
+
+
+def test_summaries_count_every_match_once() -> None:
+    matches = batch(1)
+    result = expected(matches)
+    summary = FilterSummary().add(5, result).add(2, result)
+    assert summary.num_pairs == 7
+    assert summary.num_matches == 2 * matches.num_matches
+    assert summary.num_kept == 2 * result.inlier.sum() > 0
+    assert summary.num_untested == 2 * (result.relation == 0).sum() > 0
+    assert summary.num_kept + summary.num_rejected + summary.num_untested == summary.num_matches
+
+
+@given(seeds, st.integers(0, 30))
+def test_spread_and_take_undo_each_other(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask = rng.random(n) < 0.5
+    m = int(mask.sum())
+    given_ = Verdicts(rng.random(m) < 0.5, rng.random(m), rng.integers(0, 5, m).astype(np.int8))
+    wide = given_.spread(mask)
+    assert_same(wide.take(np.flatnonzero(mask)), given_)
+    rest = wide.take(np.flatnonzero(~mask))
+    assert not rest.inlier.any()
+    assert not rest.score.any()
+    assert not rest.relation.any()
+
+
+@given(seeds, st.booleans())
+def test_picked_matches_are_those_of_the_dictionary(seed: int, has_scores: bool) -> None:
+    rng = np.random.default_rng(seed)
+    points0, points1 = rng.random((12, 2)), rng.random((9, 2))
+    matches0 = rng.integers(-2, 9, 12)
+    scores = rng.random(12) if has_scores else None
+    arrays = {"keypoints0": points0, "keypoints1": points1, "matches0": matches0, "matching_scores0": scores}
+    tensors = {name: torch.from_numpy(values)[None] for name, values in arrays.items() if values is not None}
+    same, _ = from_glue_factory(tensors)
+    picked = pick_matches("m", points0, points1, matches0, scores)
+    for name in ("keypoints0", "keypoints1", "ptr", "cost"):
+        a, b = getattr(picked, name), getattr(same, name)
+        assert (a is None and b is None) or torch.equal(a, b), name
+
+
+def test_unmatched_keypoints_and_scores_may_hold_anything() -> None:
+    points = np.array([[0.0, 1.0], [np.nan, np.inf], [2.0, 5.0]])
+    picked = pick_matches("m", points, points, np.array([2, -1]), np.array([0.25, np.nan]))
+    assert picked.keypoints1.tolist() == [[2.0, 5.0]]
+    assert picked.cost is not None
+    assert picked.cost.tolist() == [0.75]
+
+
+@pytest.mark.parametrize(
+    ("matches0", "scores", "message"),
+    [
+        ([0, 3, -1], None, "place: matches0 must be -1, -2 or one of 3 keypoints1, got 3 in row 1"),
+        ([0, -3, -1], None, "place: matches0 .* got -3 in row 1"),
+        ([0, 1, 2, -1], None, "place: matches0 has 4 rows, but there are 3 keypoints0"),
+        ([0, -1, 2], [0.5, 0.5, np.nan], "place: matching_scores0 must not be NaN, got NaN in row 2"),
+        ([-1, 1, 0], None, r"place: keypoints0, row 1, must be finite, .* got \(nan, 3.0\)"),
+        ([1, -1, 0], None, r"place: keypoints1, row 1, must be finite, .* got \(nan, 3.0\)"),
+    ],
+)
+def test_wrong_partners_are_named_by_place_and_row(
+    matches0: list[int], scores: list[float] | None, message: str
+) -> None:
+    points = np.array([[0.0, 1.0], [np.nan, 3.0], [4.0, 5.0]])
+    given_ = None if scores is None else np.array(scores)
+    with pytest.raises(ValueError, match=message):
+        pick_matches("place", points, points, np.array(matches0), given_)
+
+
+def test_the_batch_of_the_tests_has_duplicates_and_all_relations() -> None:
+    result = expected(collate_matches([batch(seed) for seed in range(5)]))
+    assert set(result.relation.tolist()) == {0, 1, 2, 3, 4}

@@ -1,0 +1,199 @@
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tensor_stereo.reports.sweep.curves import detector_curves
+from tensor_stereo.reports.sweep.pooling import (
+    CELLS,
+    SCORE_RATES,
+    SETTINGS,
+    VERDICT_RATES,
+    best_trials,
+    mildest,
+    order_detectors,
+    pool_trials,
+    settings_label,
+    stage_times,
+    varying_settings,
+    worst_pairs,
+)
+from tensor_stereo.trials import SCORE_BINS, STAGES
+from tests.reports.sweep_results import make_grid, make_results
+
+SMALL = make_grid(("fast", "sift"), outlier_rates=(0.0, 0.3), scores=("none", "topology"))
+
+
+@pytest.fixture(scope="module")
+def results() -> pl.DataFrame:
+    return make_results(SMALL, num_pairs=5)
+
+
+def samples(rows: pl.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """The bin of every correct and of every incorrect match of some rows."""
+    return tuple(
+        np.concatenate([np.repeat(np.arange(SCORE_BINS), counts) for counts in rows[f"score_counts_{name}"]])
+        for name in ("correct", "incorrect")
+    )
+
+
+def test_rates_of_a_trial_are_those_of_all_its_matches(results: pl.DataFrame) -> None:
+    pooled = pool_trials(results)
+    assert pooled["trial"].to_list() == list(range(len(SMALL)))
+    for row in pooled.iter_rows(named=True):
+        rows = results.filter(pl.col("trial") == row["trial"])
+        tp, fp, tn, fn = (rows[name].sum() for name in CELLS)
+        expected = ((tp + fn) / (tp + fp + tn + fn), tp / (tp + fn), tn / (tn + fp), tp / (tp + fp), tn / (tn + fn))
+        assert tuple(row[name] for name in VERDICT_RATES) == expected
+        assert row["num_pairs"] == 5
+        assert row["num_matches"] == rows["num_matches"].sum()
+        assert {name: row[name] for name in SETTINGS} == SMALL[row["trial"]]
+        assert row["mean_npv"] == pytest.approx(np.mean(rows["npv"].to_list()), rel=1e-12)
+        totals = [sum(stages.values()) for stages in rows["seconds"]]
+        assert row["seconds"] == pytest.approx(np.mean(totals), rel=1e-12)
+
+
+def test_auc_and_specificity_are_those_of_every_pair_of_matches(results: pl.DataFrame) -> None:
+    for row in pool_trials(results).iter_rows(named=True):
+        if row["score"] == "none":
+            assert row["auc"] is row["mean_auc"] is row["specificity_at_sensitivity_96"] is None
+            assert row["score_counts_correct"] is None
+            continue
+        correct, incorrect = samples(results.filter(pl.col("trial") == row["trial"]))
+        wins = (correct[:, None] > incorrect).mean() + (correct[:, None] == incorrect).mean() / 2
+        assert row["auc"] == pytest.approx(wins, rel=1e-12)
+        threshold = min(t for t in range(SCORE_BINS) if (incorrect <= t).mean() >= 0.96)
+        assert row["specificity_at_sensitivity_96"] == pytest.approx((correct > threshold).mean(), rel=1e-12)
+
+
+def test_seeds_are_pooled_on_request() -> None:
+    seeds = make_results(make_grid(("fast",), outlier_rates=(0.2,), seeds=(3, 4)), num_pairs=2)
+    pooled = pool_trials(seeds, over=("seed",))
+    assert "seed" not in pooled.columns
+    assert pooled["trial"].to_list() == [0, 2, 4, 6]
+    assert pooled["num_pairs"].to_list() == [2] * 4
+    assert pooled["num_matches"].to_list() == pool_trials(seeds)["num_matches"].reshape((4, 2)).arr.sum().to_list()
+
+
+def test_trials_that_differ_in_no_column_stay_apart() -> None:
+    grid = make_grid(("fast",), outlier_rates=(0.0,))
+    twice = make_results([*grid, *grid], num_pairs=2)
+    assert len(pool_trials(twice)) == len(pool_trials(twice, over=("seed",))) == 2 * len(grid)
+
+
+def test_undefined_rates_leave_the_mean_and_stay_undefined(results: pl.DataFrame) -> None:
+    nothing = {name: pl.lit(0, pl.Int64) for name in CELLS} | {name: pl.lit(math.nan) for name in VERDICT_RATES}
+    where = pl.col("scene") == "Art"
+    some = results.with_columns(
+        pl.when(where).then(value).otherwise(name).alias(name) for name, value in nothing.items()
+    )
+    others = pool_trials(results.filter(~where))
+    assert pool_trials(some)["mean_ppv"].to_list() == others["mean_ppv"].to_list()
+    none = pool_trials(results.with_columns(**nothing))
+    assert none["sensitivity"].is_nan().all()
+    assert none["mean_sensitivity"].is_null().all()
+
+
+def test_what_varies_tells_trials_apart_and_does_not_follow_from_the_detector() -> None:
+    frames = [make_results(make_grid(("fast", "sift")), num_pairs=1), make_results(make_grid(("surf",)), num_pairs=1)]
+    assert varying_settings(frames) == ["detector", "variant", "restriction", "outlier_rate"]
+    windows = [
+        make_results([trial | {"window_px": size} for trial in make_grid(("fast",))], num_pairs=1) for size in (7, 9)
+    ]
+    assert varying_settings(windows) == ["window_px", "variant", "restriction", "outlier_rate"]
+    assert varying_settings([frames[0].clear()]) == []
+
+
+def test_labels_name_words_and_numbers() -> None:
+    row: dict[str, Any] = make_grid(("sift",))[0] | {"max_ratio": None, "score": "none"}
+    assert settings_label(row, ["detector", "window_px", "max_ratio", "noise_px", "score", "threshold"]) == (
+        "sift, max. ratio off, noise px 0, no score, set test"
+    )
+    assert settings_label(row, []) == "all settings alike"
+
+
+def test_mildest_perturbation_is_found_per_detector() -> None:
+    sift, fast = make_grid(("sift",), outlier_rates=(0.2, 0.4)), make_grid(("fast",), outlier_rates=(0.0, 0.4))
+    noisy = [trial | {"noise_px": 0.5 if trial["outlier_rate"] == 0.2 else 0.0} for trial in sift]
+    found = mildest(make_results([*noisy, *fast], num_pairs=1))
+    assert set(found.select("detector", "outlier_rate", "noise_px").rows()) == {("sift", 0.2, 0.5), ("fast", 0.0, 0.0)}
+
+
+def test_worst_pairs_are_bad_at_their_best_trial(results: pl.DataFrame) -> None:
+    best: dict[tuple[str, str], float] = {}
+    for row in results.filter(pl.col("outlier_rate") == 0).iter_rows(named=True):
+        key = row["detector"], row["scene"]
+        best[key] = max(best.get(key, 0.0), (row["sensitivity"] + row["specificity"]) / 2)
+    worst = worst_pairs(results, 2)
+    expected = [sorted((best[d, s], d, s) for name, s in best if name == d)[:2] for d in ("sift", "fast")]
+    rows = list(worst.select("balanced_accuracy", "detector", "scene").iter_rows())
+    assert rows == [*expected[0], *expected[1]]
+    none = pl.lit(0, pl.Int64)
+    undefined = results.with_columns(specificity=pl.lit(math.nan), false_positive=none, true_negative=none)
+    assert worst_pairs(undefined).is_empty()
+    assert best_trials(undefined).is_empty()
+
+
+def test_best_trial_of_each_detector_has_the_highest_mean(results: pl.DataFrame) -> None:
+    pooled = pool_trials(results.filter(pl.col("outlier_rate") == 0))
+    for row in best_trials(results).iter_rows(named=True):
+        rivals = pooled.filter(pl.col("detector") == row["detector"])
+        assert row["sensitivity"] + row["specificity"] == (rivals["sensitivity"] + rivals["specificity"]).max()
+        assert row["score"] == "topology"  # equal without a score
+
+
+def test_stage_times_are_means_over_the_rows_in_which_a_stage_ran(results: pl.DataFrame) -> None:
+    times = stage_times(results)
+    assert times.columns == ["detector", *STAGES, "total"]
+    assert times["detector"].to_list() == ["sift", "fast"]
+    for (k, detector), stage in product(enumerate(times["detector"]), STAGES):
+        spent = [row[stage] for row in results.filter(pl.col("detector") == detector)["seconds"]]
+        assert times[stage][k] == pytest.approx(1000 * np.mean([value for value in spent if value > 0]), rel=1e-12)
+    plain = results.filter(pl.col("variant") == "unconstrained")
+    assert "group" not in stage_times(plain).columns
+
+
+def test_curves_hold_every_threshold_and_the_trials_that_share_them(results: pl.DataFrame) -> None:
+    found = detector_curves(results)
+    assert [item.detector for item in found] == ["sift", "fast"]
+    for item in found:
+        assert len(item.curves) == 2  # with and without objects
+        assert {row["score"] for row in item.verdicts} == {"none"}
+        assert item.curves[0].auc >= item.curves[1].auc
+        for curve in item.curves:
+            assert {row["restriction"] for row in curve.trials} == {"adjacency", "cardinality"}
+            assert set(curve.fixed_settings()) == set(SETTINGS) - {"restriction", "seed"}
+            correct, incorrect = samples(results.filter(pl.col("trial") == curve.trials[0]["trial"]))
+            for k, threshold in enumerate(range(-1, SCORE_BINS)):
+                rejected, lost = (incorrect <= threshold).sum(), (correct <= threshold).sum()
+                assert curve.sensitivity[k] == pytest.approx(rejected / len(incorrect), abs=1e-12)
+                assert curve.specificity[k] == pytest.approx(1 - lost / len(correct), abs=1e-12)
+                if rejected + lost:
+                    assert curve.ppv[k] == pytest.approx(rejected / (rejected + lost), abs=1e-12)
+                else:
+                    assert math.isnan(curve.ppv[k])
+
+
+def test_score_without_incorrect_matches_has_no_curve(results: pl.DataFrame) -> None:
+    none = results["score_counts_incorrect"].list.eval(pl.element() * 0)
+    (first, *_) = detector_curves(results.with_columns(score_counts_incorrect=none))
+    assert first.curves == ()
+    assert len(first.verdicts) == 8
+
+
+def test_empty_results_pool_to_nothing(results: pl.DataFrame) -> None:
+    empty = results.clear()
+    pooled = pool_trials(empty)
+    assert pooled.is_empty()
+    assert set(SCORE_RATES + VERDICT_RATES) <= set(pooled.columns)
+    assert detector_curves(empty) == []
+    assert stage_times(empty).is_empty()
+
+
+def test_detectors_come_in_the_order_of_the_paper() -> None:
+    assert order_detectors({"gftt", "surf", "sift", "fast", "orb"}) == ["sift", "fast", "surf", "gftt", "orb"]

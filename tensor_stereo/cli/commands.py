@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from tensor_stereo.configs import ClassifyConfig, EvaluationConfig, PipelineConfig
+from tensor_stereo.datasets.releases import RELEASES
 
 Flat = tyro.conf.arg(name="")
 
@@ -80,8 +81,7 @@ class Filter:
 class Download:
     """Fetch published stereo releases and unpack them; a broken download goes on where it stopped."""
 
-    releases: tyro.conf.Positional[tuple[str, ...]]
-    """Names such as middlebury-2005; a wrong one lists them all."""
+    releases: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(help=f"Any of {', '.join(RELEASES)}.")]
     out: Path = Path("data")
     """Folder for all of them."""
     base_url: str | None = None

@@ -10,7 +10,9 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from tensor_stereo.cli.commands import Download
+from tensor_stereo.datasets import find_pairs
 from tensor_stereo.datasets.download import DownloadProgress, download_releases
+from tensor_stereo.datasets.releases import RELEASES
 
 Show = Callable[[DownloadProgress], None]
 
@@ -20,7 +22,8 @@ def run_download_command(command: Download) -> None:
     with _show_progress() as show:
         folders = download_releases(command.releases, command.out, base_url=command.base_url, progress=show)
     for folder in folders:
-        print(folder)
+        pairs = find_pairs(folder)
+        print(f"{folder}: {len(pairs)} pairs; terms and citation: {RELEASES[folder.name].page}")
 
 
 @contextmanager
@@ -42,10 +45,11 @@ def _show_progress() -> Iterator[Show]:
         task = progress.add_task("", total=None)
 
         def update(state: DownloadProgress) -> None:
-            nonlocal shown
+            nonlocal shown, task
             if (state.file, state.step) != shown:
                 shown = state.file, state.step
-                progress.reset(task, description=f"{state.step} {state.file}", total=state.bytes_total)
+                progress.remove_task(task)
+                task = progress.add_task(f"{state.step} {state.file}", total=state.bytes_total)
             progress.update(task, completed=state.bytes_done, total=state.bytes_total)
 
         yield update

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from .calibration import Calibration as Calibration
     from .calibration import read_calibration as read_calibration
     from .discovery import find_pairs as find_pairs
+    from .download import download_releases as download_releases
     from .eth3d import find_eth3d as find_eth3d
     from .files import PairFiles as PairFiles
     from .images import read_disparity_png as read_disparity_png
@@ -35,6 +36,7 @@ _MODULES = {
     "PairFiles": "files",
     "SyntheticDataset": "synthetic",
     "build_manifest": "manifest",
+    "download_releases": "download",
     "find_eth3d": "eth3d",
     "find_kitti": "kitti",
     "find_middlebury": "middlebury",

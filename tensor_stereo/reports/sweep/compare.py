@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tensor_stereo.reports.sweep.pooling import SETTINGS, order_detectors, with_repeat
+from tensor_stereo.reports.sweep.pooling import SETTINGS, order_detectors, setting_text, with_repeat
 
 METRICS = {
     "sensitivity": "sensitivity",
@@ -23,7 +23,6 @@ NUM_RESAMPLES = 2000
 SEED = 0
 LEVEL = 0.95
 _PAIR = ("dataset", "scene")
-_KEYS = (*SETTINGS, "repeat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +30,11 @@ class Comparison:
     """Run B minus run A.
 
     Attributes:
-        trials: one row per common point of settings: ``trial`` of run A and ``trial_b``, the settings, ``num_pairs``,
-            and for each of ``METRICS`` the mean difference over the pairs (``_mean``) and the ends of its interval
-            (``_low``, ``_high``); NaN where no pair has a difference, and for the interval where just one has.
+        changed: the settings that the runs as a whole differ in, with the values of run A and of run B as text.
+        trials: one row per common point of the other settings: ``trial`` of run A and ``trial_b``, the settings of run
+            A, ``num_pairs``, and for each of ``METRICS`` the mean difference over the pairs (``_mean``) and the ends of
+            its interval (``_low``, ``_high``); NaN where no pair has a difference, and for the interval where just one
+            has.
         detectors: the same per ``detector``, and for ``all`` if there are several; each pair's differences are
             averaged over its ``num_settings`` points first.
         only: ``run`` (A or B), ``trial`` and settings of the points that one run alone has.
@@ -41,6 +42,7 @@ class Comparison:
         only_pairs: names of the pairs that A alone has, and B alone.
     """
 
+    changed: dict[str, tuple[str, str]]
     trials: pl.DataFrame
     detectors: pl.DataFrame
     only: pl.DataFrame
@@ -51,10 +53,15 @@ class Comparison:
 def compare_runs(results_a: pl.DataFrame, results_b: pl.DataFrame) -> Comparison:
     """Pair the rows of two runs by settings and pair of images.
 
+    A setting that has one value in run A and another one in run B, be it per detector or score, is what the runs are
+    compared for: trials that agree in all others are paired.
+
     Intervals are percentiles (95 %) of the mean over pairs drawn with replacement, 2000 times from seed 0; all points
     see the same draws. They say how far the mean depends on which pairs there are, nothing about other data sets.
     """
-    points_a, points_b = _points(results_a), _points(results_b)
+    changed = _changed_settings(results_a, results_b)
+    keys = [*(name for name in SETTINGS if name not in changed), "repeat"]
+    points_a, points_b = _points(results_a, keys), _points(results_b, keys)
     partner = {row["trial"]: points_b[key]["trial"] for key, row in points_a.items() if key in points_b}
     rows_a = results_a.filter(pl.col("trial").is_in(list(partner)))
     rows_a = rows_a.with_columns(pl.Series("trial_b", [partner[trial] for trial in rows_a["trial"]], pl.Int32))
@@ -77,6 +84,7 @@ def compare_runs(results_a: pl.DataFrame, results_b: pl.DataFrame) -> Comparison
     names = [{"/".join(row) for row in frame.select(*_PAIR).unique().iter_rows()} for frame in (results_a, results_b)]
     schema: dict[str, Any] = {name: results_a.schema[name] for name in ("trial", *SETTINGS)}
     return Comparison(
+        changed={name: (_values(results_a, name), _values(results_b, name)) for name in changed},
         trials=pl.DataFrame(settings, schema=schema | {"trial_b": pl.Int32}).join(trials, on="trial").sort("trial"),
         detectors=pl.concat([_of_detector(part) for part in parts or [differences]]),
         only=pl.DataFrame(only, schema={"run": pl.String} | schema),
@@ -118,10 +126,34 @@ def bootstrap_means(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], .
     return mean, low, high
 
 
-def _points(results: pl.DataFrame) -> dict[tuple[Any, ...], dict[str, Any]]:
-    """Trial and settings of each point, by settings and number among those alike."""
-    points = with_repeat(results).select("trial", *_KEYS).unique().sort("trial")
-    return {tuple(row[name] for name in _KEYS): row for row in points.iter_rows(named=True)}
+def _changed_settings(results_a: pl.DataFrame, results_b: pl.DataFrame) -> list[str]:
+    """Settings that follow from the detector, or detector and score, in both runs, but not in the same way."""
+    changed = []
+    for name in SETTINGS:
+        for parents in (("detector",), ("detector", "score")):
+            if name not in parents:
+                a, b = _follows(results_a, parents, name), _follows(results_b, parents, name)
+                if a is not None and b is not None:
+                    changed += [name] if any(a[key] != b[key] for key in a.keys() & b.keys()) else []
+                    break
+    return changed
+
+
+def _follows(results: pl.DataFrame, parents: Sequence[str], name: str) -> dict[tuple[Any, ...], Any] | None:
+    """The value of a setting for each value of its parents; None if some have several."""
+    rows = results.select(*parents, name).unique().rows()
+    values = {row[:-1]: row[-1] for row in rows}
+    return values if len(values) == len(rows) else None
+
+
+def _values(results: pl.DataFrame, name: str) -> str:
+    return ", ".join(setting_text(name, value) for value in results[name].unique().sort(nulls_last=True))
+
+
+def _points(results: pl.DataFrame, keys: Sequence[str]) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Trial and settings of each point, by some of them and its number among those that agree in all."""
+    points = with_repeat(results).select("trial", *SETTINGS, "repeat").unique().sort("trial")
+    return {tuple(row[name] for name in keys): row for row in points.iter_rows(named=True)}
 
 
 def _of_detector(differences: pl.DataFrame) -> pl.DataFrame:

@@ -67,9 +67,10 @@ def curve_figures(runs: Sequence[RunResults]) -> str:
 def _labels(curves: Sequence[tuple[int, ScoreCurve]]) -> list[str]:
     """Names of curves of one detector, by settings that do not differ within a curve."""
     firsts = [curve.trials[0] for _, curve in curves]
+    runs = [k for k, _ in curves]
     fixed = [curve.fixed_settings() for _, curve in curves]
-    names = [name for name in telling_names(firsts) if all(name in alike for alike in fixed)]
-    return distinct_labels(firsts, names or ["score"], [k for k, _ in curves])
+    names = [name for name in telling_names(firsts, runs) if all(name in alike for alike in fixed)]
+    return distinct_labels(firsts, names or ["score"], runs)
 
 
 def _figure(

@@ -141,10 +141,11 @@ def failures_data(runs: Sequence[RunResults]) -> DataTable:
 def differences_data(runs: Sequence[RunResults], comparison: Comparison) -> DataTable:
     """One row per point of settings that both runs have."""
     frame = comparison.trials
+    varying = varying_settings([run.results for run in runs])
     columns = [
         Column("trial of A", frame["trial"].to_list(), decimals=0),
         Column("trial of B", frame["trial_b"].to_list(), decimals=0),
-        *_setting_columns(frame, varying_settings([run.results for run in runs])),
+        *_setting_columns(frame, [name for name in varying if name not in comparison.changed]),
         Column("pairs", frame["num_pairs"].to_list(), decimals=0),
         *(
             Column({"mean": "B - A"}.get(end, end), frame[f"{name}_{end}"].to_list(), heading, 3, kind="signed")

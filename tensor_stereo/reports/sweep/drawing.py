@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from tensor_stereo.configs import DETECTORS
-from tensor_stereo.reports.sweep.pooling import settings_label, telling_settings
+from tensor_stereo.reports.sweep.pooling import SETTINGS, settings_label, telling_settings
 from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.sweep.svg import NUM_COLORS, Key, color_class, legend
 
@@ -37,9 +37,11 @@ def run_prefix(runs: Sequence[RunResults], k: int) -> str:
     return f"{'AB'[k]}: " if len(runs) > 1 else ""
 
 
-def telling_names(rows: Sequence[Mapping[str, Any]], *, without: Sequence[str] = ()) -> list[str]:
-    """Settings that tell rows of one detector apart, but for the seed and those in ``without``."""
-    return [name for name in telling_settings(rows) if name not in ("detector", "seed", *without)]
+def telling_names(rows: Sequence[Mapping[str, Any]], runs: Sequence[int]) -> list[str]:
+    """Settings that tell rows of one run apart; what tells the runs apart is said by their letters."""
+    parts = [[row for row, run in zip(rows, runs, strict=True) if run == k] for k in sorted(set(runs))]
+    told = {name for part in parts for name in telling_settings(part)}
+    return [name for name in SETTINGS if name in told]
 
 
 def distinct_labels(rows: Sequence[Mapping[str, Any]], names: Sequence[str], runs: Sequence[int]) -> list[str]:

@@ -155,8 +155,9 @@ def _best(series: Sequence[_Series], detector: str) -> list[_Series]:
 
 def _labels(shown: Sequence[_Series], name: str) -> list[str]:
     firsts = [item.rows[0] for item in shown]
-    names = telling_names(firsts, without=(name,)) or ["restriction"]
-    return distinct_labels(firsts, names, [item.run for item in shown])
+    runs = [item.run for item in shown]
+    names = [each for each in telling_names(firsts, runs) if each != name]
+    return distinct_labels(firsts, names or ["restriction"], runs)
 
 
 def _panel(

@@ -10,7 +10,9 @@ from tensor_stereo.reports.sweep.compare import Comparison
 from tensor_stereo.reports.sweep.pooling import pool_trials, varying_settings
 from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.sweep.summary import (
+    EXPLANATION,
     best_table,
+    changed_table,
     difference_table,
     environment_table,
     failure_table,
@@ -29,14 +31,18 @@ def render_markdown(runs: Sequence[RunResults], comparison: Comparison | None) -
     varying = varying_settings([run.results for run in runs])
     tables = [summary_table(runs), settings_table(runs)]
     if comparison is not None:
-        tables.append(difference_table(comparison))
-    tables += [best_table(run, varying) for run in runs]
+        tables += [changed_table(comparison), difference_table(comparison)]
+    tables += [best_table(run) for run in runs]
     for run in runs:
         tables += trial_tables(run, pool_trials(run.results), varying)
     tables.append(runtime_table(runs))
     for run in runs:
-        tables += [worst_table(run, varying), failure_table(run), environment_table(run)]
-    parts = [f"# Sweep report: {title}\n", *(to_markdown(_escaped(table)) for table in tables if table.rows)]
+        tables += [worst_table(run), failure_table(run), environment_table(run)]
+    parts = [
+        f"# Sweep report: {title}\n",
+        f"{EXPLANATION}\n",
+        *(to_markdown(_escaped(table)) for table in tables if table.rows),
+    ]
     return "\n".join(parts)
 
 

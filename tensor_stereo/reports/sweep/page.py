@@ -28,10 +28,12 @@ from tensor_stereo.reports.sweep.data_tables import (
 )
 from tensor_stereo.reports.sweep.drawing import run_prefix
 from tensor_stereo.reports.sweep.figures import perturbation_figures, runtime_figure, scatter_figure
-from tensor_stereo.reports.sweep.pooling import PERTURBATIONS, varying_settings
+from tensor_stereo.reports.sweep.pooling import PERTURBATIONS
 from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.sweep.summary import (
+    EXPLANATION,
     best_table,
+    changed_table,
     difference_table,
     environment_table,
     run_counts,
@@ -57,6 +59,7 @@ def render_page(runs: Sequence[RunResults], comparison: Comparison | None) -> st
     title = "Sweep report: " + " and ".join(run.name for run in runs)
     return Template(_asset("page.html")).substitute(
         title=escape(title),
+        explanation=EXPLANATION,
         style=style,
         style_hash=_hash(style),
         script=script,
@@ -94,6 +97,8 @@ def _summary(runs: Sequence[RunResults]) -> _Section:
 
 def _comparison(runs: Sequence[RunResults], comparison: Comparison, tables: list[DataTable]) -> _Section:
     parts = [f"<p>Pairs in both runs: {comparison.num_common_pairs}.{_only_pairs(comparison)}</p>"]
+    if comparison.changed:
+        parts.append(to_html(changed_table(comparison)))
     if len(comparison.trials):
         parts.append(to_html(difference_table(comparison)))
         parts.append(
@@ -103,7 +108,7 @@ def _comparison(runs: Sequence[RunResults], comparison: Comparison, tables: list
         )
         parts.append(_mount(differences_data(runs, comparison), tables))
     else:
-        parts.append("<p>The runs have no settings in common.</p>")
+        parts.append("<p>The runs have no point of settings in common.</p>")
     if len(comparison.only):
         parts.append("<h3>Settings of one run alone</h3>" + _mount(only_data(runs, comparison), tables))
     return "comparison", "Comparison", "".join(parts)
@@ -120,8 +125,7 @@ def _only_pairs(comparison: Comparison) -> str:
 
 def _measured(runs: Sequence[RunResults], tables: list[DataTable]) -> list[_Section]:
     """What needs results."""
-    varying = varying_settings([run.results for run in runs])
-    best = "".join(to_html(best_table(run, varying)) for run in runs)
+    best = "".join(to_html(best_table(run)) for run in runs)
     overview = f'<div class="beside">{scatter_figure(runs)}<div>{best}</div></div>'
     sections = [
         ("trials", "Trials", overview + _mount(trials_data(runs), tables)),
@@ -136,7 +140,7 @@ def _measured(runs: Sequence[RunResults], tables: list[DataTable]) -> list[_Sect
         else ""
     )
     times = f'<div class="beside">{runtime_figure(runs)}<div>{to_html(runtime_table(runs))}{mixed}</div></div>'
-    worst = "".join(to_html(worst_table(run, varying)) + _overlays(run) for run in runs)
+    worst = "".join(to_html(worst_table(run)) + _overlays(run) for run in runs)
     sections += [
         ("runtime", "Run-time", times),
         ("worst", "Worst pairs", worst),

@@ -34,6 +34,11 @@ RATE_HEADINGS = {
     "auc": "AUC",
     "specificity_at_sensitivity_96": "spec.@.96",
 }
+EXPLANATION = (
+    "Positive means estimated incorrectly: sensitivity is the fraction of incorrect matches that are rejected, "
+    "specificity the fraction of correct matches that are kept; spec.@.96 is the specificity that a score reaches at "
+    "sensitivity .96."
+)
 _MAX_VALUES = 12  # of a setting, written out
 
 
@@ -71,9 +76,9 @@ def settings_table(runs: Sequence[RunResults]) -> Table:
     return Table("Settings", ("setting", "role", "values"), tuple(rows))
 
 
-def best_table(run: RunResults, varying: Sequence[str]) -> Table:
+def best_table(run: RunResults) -> Table:
     """The best trial of each detector, pairs pooled."""
-    names = _mild_names(varying)
+    names = _mild_names(run)
     rates = ("fraction_incorrect", "sensitivity", "specificity", *SCORE_RATES)
     rows = tuple(
         (row["detector"].upper(), row["trial"], settings_label(row, names), *(_number(row[name]) for name in rates))
@@ -118,10 +123,10 @@ def runtime_table(runs: Sequence[RunResults]) -> Table:
     return Table("Run-time in ms per pair, mean over the trials in which a stage ran", ("detector", *stages), rows)
 
 
-def worst_table(run: RunResults, varying: Sequence[str]) -> Table:
+def worst_table(run: RunResults) -> Table:
     """The pairs on which even the best trial does badly."""
     columns = ("pair", "detector", "trial", "settings", "matches", "incorrect", "sens.", "spec.", "mean of both")
-    names = _mild_names(varying)
+    names = _mild_names(run)
     rates = ("fraction_incorrect", "sensitivity", "specificity", "balanced_accuracy")
     rows = tuple(
         (
@@ -156,6 +161,12 @@ def environment_table(run: RunResults) -> Table:
     return Table(f"{run.name}: environment", ("entry", *(headings if sessions else ())), rows)
 
 
+def changed_table(comparison: Comparison) -> Table:
+    """The settings that the runs as a whole differ in."""
+    rows = tuple((SETTINGS[name].heading, *values) for name, values in comparison.changed.items())
+    return Table("What differs between the runs", ("setting", "A", "B"), rows)
+
+
 def difference_table(comparison: Comparison) -> Table:
     """Mean differences per detector over the common settings, with their intervals."""
     rows = tuple(
@@ -187,9 +198,9 @@ def pair_name(row: Mapping[str, Any]) -> str:
     return "/".join(filter(None, (row["dataset"], row["scene"])))
 
 
-def _mild_names(varying: Sequence[str]) -> list[str]:
-    """Settings worth a label where the detector is named and the perturbation is the mildest."""
-    return [name for name in varying if name not in ("detector", *PERTURBATIONS)]
+def _mild_names(run: RunResults) -> list[str]:
+    """Settings worth a label where run and detector are named and the perturbation is the mildest."""
+    return [name for name in varying_settings([run.results]) if name not in ("detector", *PERTURBATIONS)]
 
 
 def flatten(value: Any, name: str = "") -> dict[str, str]:

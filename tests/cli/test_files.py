@@ -1,0 +1,69 @@
+"""The commands that turn files into other files: render, filter, download, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from tensor_stereo.cli import main
+
+
+def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str], *words: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1, error
+    for word in words:
+        assert word in error
+
+
+def test_rendered_pairs_are_indexed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["render", str(tmp_path / "pairs"), "--num-pairs", "2", "--seed", "3"])
+    listed = capsys.readouterr().out.strip()
+    main(["index", listed, "--out", str(tmp_path / "m.parquet")])
+    assert "2 pairs in" in capsys.readouterr().out
+
+
+def test_what_classify_wrote_is_filtered_alike(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["render", str(tmp_path), "--num-pairs", "1"])
+    images = [str(tmp_path / f"synthetic-00-{view}.png") for view in (0, 1)]
+    main(["classify", *images, "--out", str(tmp_path / "matches.csv")])
+    capsys.readouterr()
+    main(["filter", str(tmp_path / "matches.csv"), "--out", str(tmp_path / "filtered.csv")])
+    printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    before, after = pl.read_csv(tmp_path / "matches.csv"), pl.read_csv(tmp_path / "filtered.csv")
+    assert before["inlier"].equals(after["inlier"])
+    assert int(printed["num_kept"]) == before["inlier"].sum()
+    strict = tmp_path / "strict.csv"
+    main(["filter", str(tmp_path / "matches.csv"), "--out", str(strict), "--restriction", "adjacency"])
+    assert 0 < pl.read_csv(strict)["inlier"].sum() < before["inlier"].sum()
+
+
+@pytest.mark.slow
+def test_a_run_gets_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["render", str(tmp_path / "pairs"), "--num-pairs", "2"])
+    main(["index", str(tmp_path / "pairs" / "synthetic.csv"), "--out", str(tmp_path / "m.parquet")])
+    runs = []
+    for window in (9, 11):
+        settings = tmp_path / f"{window}.toml"
+        settings.write_text(f'[grid]\ndetector = "fast"\nfast.window_px = {window}\n')
+        runs.append(str(tmp_path / f"run{window}"))
+        main(["sweep", str(settings), "--manifest", str(tmp_path / "m.parquet"), "--out", runs[-1], "--workers", "1"])
+    capsys.readouterr()
+    main(["report", runs[0]])
+    assert (tmp_path / "run9" / "report.html").stat().st_size > 10_000
+    assert "data:image/png" in (tmp_path / "run9" / "report.html").read_text()  # the worst pairs
+    main(["report", *runs, "--out", str(tmp_path / "compared")])
+    assert "run11" in (tmp_path / "compared" / "report.md").read_text()
+    assert capsys.readouterr().out.count("report.") == 4
+
+
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _fails(["download", "kitti-2051", "--out", str(tmp_path)], capsys, "kitti-2051", "kitti-2015")
+    _fails(["download", "--out", str(tmp_path)], capsys, "names")
+    _fails(["report", str(tmp_path)], capsys, "no run")
+    _fails(["filter", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b.txt")], capsys, "source", ".npz")
+    _fails(["filter", str(tmp_path / "a.csv"), "--out", str(tmp_path / "b.csv")], capsys, "a.csv")

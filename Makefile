@@ -65,12 +65,12 @@ fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFu
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
 
 BENCH_VENV ?= .venv-bench
-SUITES := graphs relations classify soft matching pipeline scaling adversarial
+SUITES := graphs relations classify soft matching pipeline scaling adversarial sweep
 
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)
 	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet -c $(CONSTRAINTS) torch kornia numpy scipy mahotas polars rich tyro \
-	  matplotlib pillow opencv-contrib-python-headless shull
+	  matplotlib pillow ray opencv-contrib-python-headless shull
 	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps --force-reinstall .
 	cd benchmarks && for suite in $(SUITES); do $(abspath $(BENCH_VENV))/bin/python bench_$$suite.py || exit 1; done
 

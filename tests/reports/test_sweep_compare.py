@@ -108,6 +108,25 @@ def test_points_that_agree_in_all_columns_are_paired_in_order() -> None:
     assert comparison.trials["trial_b"].to_list() == comparison.trials["trial"].to_list() == [0, 1, 2, 3]
 
 
+def test_what_the_runs_as_a_whole_differ_in_does_not_part_them() -> None:
+    gates = {"max_row_offset_px": None, "max_disparity_px": None}
+    grid = make_grid(("sift", "fast"), scores=("none", "topology"))
+    other = [trial | gates | {"feature_backend": "opencv"} for trial in grid if trial["detector"] == "sift"]
+    other = [trial | {"temperature": 2.0 if trial["temperature"] else None} for trial in other]
+    comparison = compare_runs(make_results(grid, num_pairs=2), make_results(other, num_pairs=2))
+    assert comparison.changed == {
+        "feature_backend": ("kornia, –", "opencv"),
+        "max_row_offset_px": ("1", "off"),
+        "max_disparity_px": ("128", "off"),
+        "temperature": ("1, –", "2, –"),
+    }
+    assert comparison.trials["trial"].to_list() == comparison.trials["trial_b"].to_list() == list(range(len(other)))
+    assert set(comparison.only["detector"]) == {"fast"}
+    scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in ("topology", "consensus")]
+    assert compare_runs(*scores).changed == {"score": ("topology", "consensus")}
+    assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
+
+
 def test_runs_without_common_settings_have_no_differences() -> None:
     a = make_results(make_grid(("sift",)), num_pairs=2)
     b = make_results(make_grid(("fast",)), num_pairs=2)

@@ -116,6 +116,14 @@ def test_curves_of_two_runs_share_colours_and_differ_in_their_lines(results: pl.
     assert "B: constrained: AUC" in html
 
 
+def test_what_tells_two_runs_apart_is_left_to_their_letters(results: pl.DataFrame) -> None:
+    other = make_results([trial | {"max_disparity_px": None} for trial in GRID], num_pairs=4)
+    runs = [make_run("a", results), make_run("b", other)]
+    for html in (curve_figures(runs), perturbation_figures(runs, "outlier_rate")):
+        assert not any("disparity" in text for text in legend_texts(html))
+        assert any(text.startswith("B: constrained") for text in legend_texts(html))
+
+
 def test_many_scores_show_the_best_and_say_so() -> None:
     scores = [f"score-{k}" for k in range(MAX_SERIES + 2)]
     results = make_results(make_grid(("fast",), outlier_rates=(0.0,), scores=scores), num_pairs=2)

@@ -197,7 +197,7 @@ def test_two_runs_are_compared(results: pl.DataFrame, tmp_path: Path) -> None:
 def test_runs_without_common_settings_say_so(results: pl.DataFrame, tmp_path: Path) -> None:
     other = make_results(make_grid(("gftt",)), num_pairs=4)
     page, _ = render([make_run("a", results), make_run("b", other)], tmp_path)
-    assert "The runs have no settings in common." in page.inside("p")
+    assert "The runs have no point of settings in common." in page.inside("p")
     assert "differences" not in page.data()
 
 

@@ -52,7 +52,7 @@ def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     optionally ``ptr`` (B + 1,), ``cost`` (M,) and ``group`` (M,); the results are (M,). One pair, as LightGlue and
     glue-factory have it: ``keypoints0`` (N0, 2), ``keypoints1`` (N1, 2), ``matches0`` (N0,) with -1 and -2, and
     optionally ``matching_scores0`` (N0,), higher is better; the results are (N0,), and False, 0 and UNTESTED where
-    there is no match. All arrays are carried through as they are.
+    there is no match. All other arrays are carried through as they are.
 
     Nothing is unpickled, and no array is allocated before the shape and dtype of its header fit the member's size.
 
@@ -84,7 +84,7 @@ def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
 def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     """The members by name of their array; raises unless all hold plain arrays of the size that they claim."""
     members: dict[str, zipfile.ZipInfo] = {}
-    num_bytes_held = source.stat().st_size
+    num_bytes_left = source.stat().st_size  # members must not overlap
     for info in archive.infolist():
         name = info.filename.removesuffix(".npy")
         if name == info.filename or "/" in name or "\\" in name:
@@ -95,8 +95,8 @@ def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
         place = f"{source}, array {name!r}"
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
             raise ValueError(f"{place} must be stored or deflated without a password, as NumPy writes it")
-        end = info.header_offset + info.compress_size
-        if info.header_offset < 0 or end > num_bytes_held or info.file_size > _MAX_RATIO * info.compress_size:
+        num_bytes_left -= info.compress_size
+        if info.header_offset < 0 or num_bytes_left < 0 or info.file_size > _MAX_RATIO * info.compress_size:
             raise ValueError(f"{place} claims {info.file_size} bytes, which the archive cannot hold")
         shape, dtype, header_bytes = _read_header(place, archive, info)
         if dtype.hasobject:

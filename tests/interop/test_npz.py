@@ -215,13 +215,14 @@ def test_more_rows_than_the_limit_are_refused_before_they_are_read(
         filter_npz(source, tmp_path / "out.npz", DelaunayFilter())
 
 
-def test_sizes_that_the_archive_cannot_hold_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("field", "size", "claimed"), [(24, 2**32 - 2, 2**32 - 2), (20, 2**20, 10**6 + 128)])
+def test_sizes_that_the_archive_cannot_hold_are_refused(tmp_path: Path, field: int, size: int, claimed: int) -> None:
     source = write_archive(tmp_path / "in.npz", {**GOOD, "z.npy": header((10**6,), "|u1") + bytes(10**6)})
     data = bytearray(source.read_bytes())
-    entry = data.rindex(b"PK\x01\x02")  # the directory's record of z.npy
-    data[entry + 24 : entry + 28] = (2**32 - 2).to_bytes(4, "little")  # its size when unpacked
+    entry = data.rindex(b"PK\x01\x02")  # the directory's record of z.npy, which has its size packed and unpacked
+    data[entry + field : entry + field + 4] = size.to_bytes(4, "little")
     source.write_bytes(data)
-    with pytest.raises(ValueError, match="array 'z' claims 4294967294 bytes, which the archive cannot hold"):
+    with pytest.raises(ValueError, match=f"array 'z' claims {claimed} bytes, which the archive cannot hold"):
         filter_npz(source, tmp_path / "out.npz", DelaunayFilter())
 
 

@@ -10,6 +10,7 @@ import polars as pl
 
 from tensor_stereo.datasets import PairFiles, read_manifest, read_pair
 from tensor_stereo.reports.sweep.overlays import draw_overlay
+from tensor_stereo.reports.sweep.pooling import worst_pairs
 from tensor_stereo.reports.sweep.results import Overlay, RunResults
 from tensor_stereo.sweeps import read_config, read_errors, read_results
 from tensor_stereo.trials import TrialRunner
@@ -20,12 +21,10 @@ LOG = logging.getLogger(__name__)
 def load_run(run: Path | str, *, num_overlays: int = 2) -> RunResults:
     """Read a run folder, and draw the worst pairs of each detector anew.
 
-    Of each detector the point of the grid counts that has the best mean of sensitivity and specificity over pairs,
-    without exchanged matches and noise if there is such a point; its worst pairs are those where that mean is lowest.
-
     Args:
         run: folder of :func:`tensor_stereo.sweeps.run_sweep`, finished or not.
-        num_overlays: pictures per detector; a pair whose images cannot be read has none, which is logged.
+        num_overlays: pictures per detector, of its :func:`~tensor_stereo.reports.sweep.pooling.worst_pairs`; a pair
+            whose images cannot be read has none, which is logged.
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
@@ -41,31 +40,6 @@ def load_run(run: Path | str, *, num_overlays: int = 2) -> RunResults:
         environment=json.loads(environment.read_text(encoding="utf-8")) if environment.exists() else [],
         overlays=tuple(_overlays(run, results, num_overlays)),
     )
-
-
-def worst_pairs(results: pl.DataFrame, num_pairs: int) -> pl.DataFrame:
-    """The rows of ``results`` that :func:`load_run` draws, detector by detector, the worst first.
-
-    >>> from tensor_stereo.evaluation import ROW_SCHEMA
-    >>> len(worst_pairs(pl.DataFrame(schema={"unit": pl.Int32} | ROW_SCHEMA), 2))
-    0
-    """
-    rows = results.with_columns(merit=pl.mean_horizontal("sensitivity", "specificity"), harm=_HARM)
-    rows = rows.filter(pl.col("merit").is_finite())
-    rows = rows.filter(pl.col("harm") == pl.col("harm").min().over("detector"))
-    means = rows.group_by("detector", "trial").agg(mean=pl.col("merit").mean())
-    best = means.sort("detector", "mean", "trial", descending=[False, True, False]).unique(
-        "detector", keep="first", maintain_order=True
-    )
-    return (
-        rows.join(best, on=["detector", "trial"])
-        .sort("detector", "merit", "dataset", "scene")
-        .group_by("detector", maintain_order=True)
-        .head(num_pairs)
-    )
-
-
-_HARM = pl.col("outlier_rate") + pl.col("noise_px")  # smallest where the putative matches are as they were found
 
 
 def _overlays(run: Path, results: pl.DataFrame, num_pairs: int) -> list[Overlay]:

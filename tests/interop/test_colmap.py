@@ -127,6 +127,8 @@ def test_the_copy_is_the_source_but_for_what_was_filtered(pycolmap: Any, tmp_pat
         assert query(source, text) == query(target, text)
     schema = "SELECT name, sql FROM sqlite_master WHERE name != ? ORDER BY name".replace("?", f"'{TABLE}'")
     assert query(source, schema) == query(target, schema)
+    assert query(source, "PRAGMA journal_mode") == [("wal",)]
+    assert query(target, "PRAGMA journal_mode") == [("delete",)]  # readable where no file can be made beside it
 
 
 def test_a_database_without_the_other_tables_and_blocks_make_no_difference(

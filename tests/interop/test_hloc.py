@@ -210,10 +210,10 @@ def test_a_joined_name_must_split_in_one_way(tmp_path: Path) -> None:
         filter_hloc(source, target, DelaunayFilter(), keypoints)
 
 
-def test_an_image_may_lie_in_a_folder_named_keypoints(tmp_path: Path) -> None:
+def test_images_may_be_named_like_datasets(tmp_path: Path) -> None:
     source, target, keypoints = paths(tmp_path)
     points = features(6)
-    names = "keypoints/1.jpg", "matches0/2.jpg"
+    names = "keypoints/1.jpg", "matches0"
     write_features(keypoints, dict(zip(names, (points["db/1.jpg"], points["db/2.jpg"]), strict=True)))
     write_matches(source, {names: partners(6)})
     assert filter_hloc(source, target, DelaunayFilter(), keypoints).num_kept > 0
@@ -368,11 +368,12 @@ def test_links_in_place_of_the_results_are_replaced_and_not_followed(tmp_path: P
     before = (tmp_path / "other.h5").read_bytes()
     with h5py.File(source, "r+") as file:
         file["db-1.jpg/db-2.jpg/score"] = h5py.ExternalLink("other.h5", "/a")
+        file["db-1.jpg/db-2.jpg/inlier"] = h5py.ExternalLink("none.h5", "/a")
     filter_hloc(source, target, DelaunayFilter(), keypoints)
     assert (tmp_path / "other.h5").read_bytes() == before
     with h5py.File(target) as result:
         group = result["db-1.jpg/db-2.jpg"]
-        assert isinstance(group.get("score", getlink=True), h5py.HardLink)
+        assert all(isinstance(group.get(name, getlink=True), h5py.HardLink) for name in ("score", "inlier"))
 
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:

@@ -33,11 +33,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     from tensor_stereo.cli.runners import run  # torch is needed from here on
-    from tensor_stereo.sweeps.journal import RunInUseError
+    from tensor_stereo.sweeps.journal import SweepError
 
     try:
         code = run(command)
-    except (ValueError, TypeError, ImportError, RunInUseError, OSError) as error:
+    except (ValueError, TypeError, ImportError, SweepError, OSError) as error:
         print(f"tensor-stereo: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:

@@ -1,1 +1,1 @@
-"""Matches to and from the forms of other libraries, one module each; only OpenCV's imports its library."""
+"""Matches to and from the forms of other libraries and files, one module each; h5py and pycolmap load when needed."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .grid import expand_grid as expand_grid
 from .grid import read_grid as read_grid
 from .journal import RunInUseError as RunInUseError
+from .journal import SweepError as SweepError
 from .plan import Plan as Plan
 from .plan import build_plan as build_plan
 from .results import read_config as read_config

@@ -1,18 +1,22 @@
-"""Where tasks run: one interface, and the pool of processes on this machine."""
+"""Where tasks run: one interface, and worker processes on this machine."""
 
 from __future__ import annotations
 
 import multiprocessing
-import multiprocessing.connection
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.process import BaseProcess
 from typing import NamedTuple, Protocol
 
 from tensor_stereo.configs import SweepConfig
+from tensor_stereo.sweeps.journal import SweepError
 from tensor_stereo.sweeps.plan import Task
 from tensor_stereo.sweeps.units import UnitResult, run_tasks
 
@@ -29,12 +33,9 @@ class Engine(Protocol):
 
     Attributes:
         num_workers: batches that run at a time.
-        blames_exactly: whether a batch that is said to have lost its worker is the one that ran there; otherwise every
-            batch under way is suspect.
     """
 
     num_workers: int
-    blames_exactly: bool
 
     def submit(self, tasks: Sequence[Task]) -> None:
         """Queue a batch."""
@@ -43,61 +44,106 @@ class Engine(Protocol):
         """Batches that ended since the last call; waits for one at most that long."""
 
     def close(self) -> None:
-        """Stop the workers after what they are at."""
+        """End the workers at once; what they are at is lost."""
+
+
+class WorkerStartError(SweepError):
+    """No worker comes to life."""
+
+
+@dataclass
+class _Worker:
+    """A process, and what it is at; it has begun once it has said so."""
+
+    process: BaseProcess
+    has_begun: bool = False
+    tasks: tuple[Task, ...] = ()
 
 
 class LocalEngine:
-    """A pool of processes on this machine, one thread each.
+    """Processes on this machine, one thread and one pipe each.
+
+    Not the standard library's pool: it cannot say which batch a lost process was at, and it waits for ever for the rest
+    of a result that a process was sending when it died. Here the end of a pipe is the death of its worker.
 
     Workers are forked from a server that has imported the library and nothing else, so that they start at once and no
-    thread is lost in a fork; where there is no such server they are started anew. A worker ends with its parent.
+    thread is lost in a fork; where there is no such server they are started anew. They leave signals to their parent,
+    and end with it.
 
     Args:
         config: the points of the sweep.
         num_workers: processes; None: one per core.
     """
 
-    blames_exactly = False
-
     def __init__(self, config: SweepConfig, num_workers: int | None = None) -> None:
         self.num_workers = num_workers or _num_cores()
         self._config = config
-        self._pool: ProcessPoolExecutor | None = None
-        self._running: dict[Future[list[UnitResult]], tuple[Task, ...]] = {}
-        server = "forkserver" in multiprocessing.get_all_start_methods()
-        self._context = multiprocessing.get_context("forkserver" if server else "spawn")
-        if server:
-            self._context.set_forkserver_preload(["tensor_stereo.sweeps.units"])
+        self._waiting: deque[tuple[Task, ...]] = deque()
+        self._workers: dict[Connection, _Worker] = {}
+        self._context = _context()
 
     def submit(self, tasks: Sequence[Task]) -> None:
-        try:
-            future = self._workers().submit(_run, tuple(tasks))
-        except BrokenProcessPool:  # a worker died while it had nothing to do
-            self._pool = None
-            future = self._workers().submit(_run, tuple(tasks))
-        self._running[future] = tuple(tasks)
+        self._waiting.append(tuple(tasks))
+        while len(self._workers) < self.num_workers:
+            self._start_worker()
+        self._dispatch()
 
     def collect(self, timeout_seconds: float) -> list[Outcome]:
-        done, _ = wait(self._running, timeout_seconds, FIRST_COMPLETED)
         outcomes = []
-        for future in done:
-            tasks = self._running.pop(future)
+        ready = wait(list(self._workers), timeout_seconds)
+        for connection in [connection for connection in self._workers if connection in ready]:
+            worker = self._workers[connection]
             try:
-                outcomes.append(Outcome(tasks, future.result()))
-            except BrokenProcessPool:  # takes every batch with it
-                self._pool = None
-                outcomes.append(Outcome(tasks, None))
+                message = connection.recv()
+            except (EOFError, OSError):  # also in the middle of a message
+                self._bury(connection)
+                if not worker.has_begun:
+                    raise WorkerStartError(
+                        "a worker process ended before it began; what it said stands above. A script that runs a sweep "
+                        'must be a file and do so below: if __name__ == "__main__"'
+                    ) from None
+                if worker.tasks:
+                    outcomes.append(Outcome(worker.tasks, None))
+                self._start_worker()
+                continue
+            if worker.has_begun:
+                outcomes.append(Outcome(worker.tasks, message))
+            worker.has_begun, worker.tasks = True, ()
+        self._dispatch()
         return outcomes
 
     def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
-            self._pool = None
+        for connection in list(self._workers):
+            self._bury(connection)
 
-    def _workers(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.num_workers, self._context, _start_worker, (self._config,))
-        return self._pool
+    def _start_worker(self) -> None:
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_work, args=(theirs, self._config), daemon=True)
+        process.start()
+        theirs.close()  # so that the end of the process is the end of the pipe
+        self._workers[ours] = _Worker(process)
+
+    def _bury(self, connection: Connection) -> None:
+        worker = self._workers.pop(connection)
+        worker.process.kill()
+        worker.process.join()
+        connection.close()
+
+    def _dispatch(self) -> None:
+        """Give what waits to workers that have begun and are idle."""
+        for connection, worker in self._workers.items():
+            if self._waiting and worker.has_begun and not worker.tasks:
+                worker.tasks = self._waiting.popleft()
+                with suppress(OSError):  # it has just died, which the next look at its pipe tells
+                    connection.send(worker.tasks)
+
+
+def _context() -> SpawnContext | ForkServerContext:
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tensor_stereo.sweeps.units"])
+    return context
 
 
 def _num_cores() -> int:
@@ -105,22 +151,23 @@ def _num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_config: SweepConfig  # of this worker
-
-
-def _start_worker(config: SweepConfig) -> None:
-    global _config
-    _config = config
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
+def _work(connection: Connection, config: SweepConfig) -> None:
+    """What a worker process does until its pipe ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the parent decides when to stop
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    connection.send(None)
+    while True:
+        try:
+            tasks = connection.recv()
+        except (EOFError, OSError):
+            return
+        connection.send(run_tasks(config, tasks))
 
 
 def _end_with_parent() -> None:
+    """End a worker that computes while its parent is killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
-        multiprocessing.connection.wait([parent.sentinel])
+        wait([parent.sentinel])
         os._exit(1)
-
-
-def _run(tasks: tuple[Task, ...]) -> list[UnitResult]:
-    return run_tasks(_config, tasks)

@@ -141,6 +141,10 @@ def _convert(name: str, value: Any, hint: Any) -> Any:
         return float(value)
     if type(value) is not hint:
         raise ValueError(f"{name} must be {hint.__name__}, got {value!r}")
+    if value != value:
+        raise ValueError(f"{name} must be a number, got {value!r}")
+    if hint is int and abs(value) >= 2**31:
+        raise ValueError(f"{name} must lie within 32 bits, got {value}")
     return value
 
 

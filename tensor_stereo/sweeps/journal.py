@@ -22,17 +22,28 @@ class JournalState:
     """What the journals of a run say.
 
     Attributes:
-        done: units with rows or an error.
-        errors: the record of each failed unit.
+        good: units with rows.
+        errors: the record of each other unit that failed; a unit may fail, and be good another time.
         files: size and hash of each finished part, by path relative to the run.
+        names: paths of all parts that were ever finished, also damaged and missing ones.
     """
 
-    done: set[int] = field(default_factory=set)
+    good: set[int] = field(default_factory=set)
     errors: dict[int, dict[str, Any]] = field(default_factory=dict)
     files: dict[str, tuple[int, str]] = field(default_factory=dict)
+    names: set[str] = field(default_factory=set)
+
+    @property
+    def done(self) -> set[int]:
+        """Units that are not to be done again."""
+        return self.good | self.errors.keys()
 
 
-class RunInUseError(RuntimeError):
+class SweepError(RuntimeError):
+    """A sweep cannot run here and now, whatever its settings."""
+
+
+class RunInUseError(SweepError):
     """Another process works on the same run."""
 
 
@@ -44,6 +55,7 @@ def read_journals(out: Path, *, verify: bool = False) -> JournalState:
         verify: read and hash the files instead of asking for their size.
     """
     state = JournalState()
+    lost: set[int] = set()
     for path in sorted(out.glob("journal-*.jsonl")):
         for line in path.read_bytes().splitlines():
             try:
@@ -58,21 +70,26 @@ def read_journals(out: Path, *, verify: bool = False) -> JournalState:
             ]
             for name in damaged:
                 LOG.warning("%s is damaged; its units are done again", name)
+            state.names |= entry["files"].keys()  # a name is never used twice
             if damaged:
+                lost |= set(entry["done"])
                 entry = entry | {"files": {}, "done": []}
             enter(entry, state)
+    for unit in lost - state.good:  # they were good, so an older error does not count
+        state.errors.pop(unit, None)
     return state
 
 
 def enter(entry: dict[str, Any], state: JournalState) -> None:
-    """Enter one line of a journal; what it says of a unit replaces what was said before."""
+    """Enter one line of a journal, in any order: a unit with rows is good, whatever else was said of it."""
     state.files.update(entry["files"])
+    state.names |= entry["files"].keys()
     for unit in entry["done"]:
-        state.done.add(unit)
+        state.good.add(unit)
         state.errors.pop(unit, None)
     for record in entry["errors"]:
-        state.done.add(record["unit"])
-        state.errors[record["unit"]] = record
+        if record["unit"] not in state.good:
+            state.errors[record["unit"]] = record
 
 
 def append(entry: dict[str, Any], journal: IO[bytes]) -> None:

@@ -31,8 +31,6 @@ class RayEngine:
         ConnectionError: if there is no cluster at ``address``.
     """
 
-    blames_exactly = True
-
     def __init__(self, config: SweepConfig, num_workers: int | None = None, address: str | None = None) -> None:
         try:
             self._ray: Any = importlib.import_module("ray")
@@ -42,7 +40,7 @@ class RayEngine:
         self._started = not ray.is_initialized()
         if self._started:
             local = {} if address else {"num_cpus": num_workers, "include_dashboard": False}
-            ray.init(address=address, log_to_driver=False, configure_logging=False, **local)
+            ray.init(address=address or "local", log_to_driver=False, configure_logging=False, **local)
         self.num_workers = num_workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._config = ray.put(config)
         self._task = ray.remote(num_cpus=1, max_retries=0)(run_tasks)

@@ -82,17 +82,18 @@ def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -
         ValueError: if it holds no such unit, or no matches.
     """
     rows = _read_parts(run, "metrics", METRICS_SCHEMA).filter(dataset=dataset, scene=scene, trial=trial)
-    units = rows.select("unit").collect()["unit"]
+    units = rows.select("unit", "score").collect()
     if not len(units):
         raise ValueError(f"{run} has no finished unit of {dataset}/{scene} with trial {trial}")
-    stored = _read_parts(run, "matches", MATCHES_SCHEMA).filter(unit=units[0], trial=trial)
+    stored = _read_parts(run, "matches", MATCHES_SCHEMA).filter(unit=units["unit"][0], trial=trial)
     table = stored.collect()
     if not any(Path(run, "matches").glob("part-*.parquet")):
         raise ValueError(f"{run} keeps no matches; set export_matches = true above the grid")
     columns = {name: torch.from_numpy(table[name].to_numpy(writable=True)) for name in ("x0", "y0", "x1", "y1")}
+    has_score = units["score"][0] != "none"
     cost, score = (
-        None if table[name].null_count() else torch.from_numpy(table[name].to_numpy(writable=True))
-        for name in ("cost", "score")
+        torch.from_numpy(table[name].to_numpy(writable=True)) if there else None
+        for name, there in (("cost", not table["cost"].null_count()), ("score", has_score))
     )
     return StoredMatches(
         matches=Matches(

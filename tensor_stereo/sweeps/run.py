@@ -48,7 +48,8 @@ class SweepProgress:
         num_units: units that this process has to do or found done.
         num_done: those that are done, found so or failed.
         num_failed: those of them that failed.
-        num_new: those that this process did.
+        num_new: those that this process did, of
+        num_todo: those that it will do, unless it is stopped.
         seconds: since the first unit was submitted.
     """
 
@@ -56,6 +57,7 @@ class SweepProgress:
     num_done: int
     num_failed: int
     num_new: int
+    num_todo: int
     seconds: float
 
     @property
@@ -66,7 +68,7 @@ class SweepProgress:
     def seconds_left(self) -> float:
         """NaN before the first unit is done."""
         rate = self.units_per_second
-        return (self.num_units - self.num_done) / rate if rate else float("nan")
+        return (self.num_todo - self.num_new) / rate if rate else float("nan")
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,9 @@ def run_sweep(
         limit: do no more than so many units now.
         retry_errors: do failed units again.
         verify: hash the finished parts instead of trusting their size.
-        units_per_part: units after which a part is written: what a crash costs at most, and
-        seconds_per_part: the time after which one is written in any case.
+        units_per_part: units after which a part is written, and
+        seconds_per_part: the time after which one is written in any case; what a crash costs, besides the units under
+            way.
         log_level: of ``log.jsonl``.
         on_progress: called after every batch.
 
@@ -121,7 +124,7 @@ def run_sweep(
 
     Raises:
         ValueError: for bad settings, a wrong manifest, or a run folder of another configuration.
-        RunInUseError: if another process works on the same shard.
+        SweepError: if another process works on the same shard, or no worker starts.
         OSError: if the run folder cannot be written; what its journal lists is safe.
     """
     out = Path(out)
@@ -151,8 +154,9 @@ def run_sweep(
         verify=verify,
     )
     with store, log_to_file(out / "log.jsonl", log_level):
-        known = store.state.done - store.state.errors.keys() if retry_errors else store.state.done
+        known = store.state.good if retry_errors else store.state.done
         todo = [unit for unit in units if unit not in known]
+        num_found = len(units) - len(todo)
         todo = todo if limit is None else todo[:limit]
         LOG.info("start", extra={"units": len(units), "todo": len(todo), "engine": engine, "shard": list(shard)})
         append_environment(out, _environment(engine, num_workers, shard))
@@ -160,7 +164,7 @@ def run_sweep(
         if todo:
             local = engine == "local"
             workers = LocalEngine(config, num_workers) if local else RayEngine(config, num_workers, ray_address)
-        summary = drive(workers, plan, store, units, todo, on_progress)
+        summary = drive(workers, plan, store, units, todo, num_found, on_progress)
         LOG.info("end", extra={"interrupted": summary.interrupted, **asdict(summary.progress)})
         return summary
 
@@ -171,16 +175,18 @@ def drive(
     store: RunStore,
     units: Collection[int],
     todo: Collection[int],
+    num_found: int = 0,
     on_progress: Callable[[SweepProgress], None] | None = None,
 ) -> SweepSummary:
     """Run the units ``todo`` among ``units`` on an engine, which is closed at the end; None: there is nothing to do."""
-    driver = _Driver(plan, store, units, todo, on_progress)
+    driver = _Driver(plan, store, units, todo, num_found, on_progress)
     if engine is not None:
         try:
             driver.run(engine)
         finally:
             engine.close()
-    return SweepSummary(driver.progress(), driver.stopping)
+    end = driver.progress()
+    return SweepSummary(end, interrupted=driver.stopping and end.num_new < end.num_todo)
 
 
 def check_trials(config: SweepConfig) -> None:
@@ -207,11 +213,12 @@ class _Driver:
         store: RunStore,
         units: Collection[int],
         todo: Collection[int],
+        num_found: int,
         on_progress: Callable[[SweepProgress], None] | None,
     ) -> None:
         self.stopping = False
         self._plan, self._store, self._on_progress = plan, store, on_progress
-        self._num_units, self._num_found = len(units), len(units) - len(todo)
+        self._num_units, self._num_todo, self._num_found = len(units), len(todo), num_found
         self._num_new = 0
         self._num_failed = len(store.state.errors.keys() & set(units) - set(todo))
         self._waiting = deque(todo)
@@ -221,47 +228,43 @@ class _Driver:
 
     def progress(self) -> SweepProgress:
         done = self._num_found + self._num_new
-        return SweepProgress(self._num_units, done, self._num_failed, self._num_new, time.monotonic() - self._begun)
+        seconds = time.monotonic() - self._begun
+        return SweepProgress(self._num_units, done, self._num_failed, self._num_new, self._num_todo, seconds)
 
     def run(self, engine: Engine) -> None:
-        """Run what waits; where the engine cannot tell at which batch a worker died, each suspect runs alone."""
-        under_way, accused = 0, -1
+        """Run what waits; units at which a worker died run again one by one, so that the guilty one is known."""
+        under_way = 0
         with self._stop_on_signals():
             while under_way or (not self.stopping and (self._waiting or self._suspects)):
-                while not self.stopping and (self._waiting or self._suspects):
-                    alone = bool(self._suspects) and not engine.blames_exactly
-                    if under_way >= (1 if alone else 2 * engine.num_workers) or accused >= 0:
-                        break
-                    tasks = [self._suspects.popleft()] if self._suspects else self._next_batch(engine.num_workers)
-                    accused = tasks[0].unit if alone else -1
-                    engine.submit(tasks)
+                while not self.stopping and under_way < engine.num_workers and (self._waiting or self._suspects):
+                    engine.submit(
+                        [self._suspects.popleft()] if self._suspects else self._next_batch(engine.num_workers)
+                    )
                     under_way += 1
                 for outcome in engine.collect(timeout_seconds=0.5):
                     under_way -= 1
-                    sure = engine.blames_exactly or accused >= 0
-                    accused = -1
-                    self._take(outcome, is_guilty=sure and len(outcome.tasks) == 1)
+                    self._take(outcome)
         self._store.flush()
 
-    def _take(self, outcome: Outcome, *, is_guilty: bool) -> None:
+    def _take(self, outcome: Outcome) -> None:
         """Store the results of a batch, or try its units again one by one."""
         results = outcome.results
         if results is None:
             LOG.warning("a worker died", extra={"units": [task.unit for task in outcome.tasks]})
             results = []
             for task in outcome.tasks:
-                self._deaths[task.unit] += is_guilty
+                self._deaths[task.unit] += len(outcome.tasks) == 1
                 if self._deaths[task.unit] >= MAX_DEATHS:
                     reason = WorkerDiedError(f"{MAX_DEATHS} workers died at this unit; killed, or out of memory?")
                     results.append(failed_unit(self._plan.config, task, "worker", reason))
                 else:
                     self._suspects.append(task._replace(attempt=task.attempt + 1))
         for result in results:
-            self._store.add(result)
             self._num_new += 1
             if result.error is not None:
                 self._num_failed += 1
                 LOG.error("unit failed", extra={"unit": result.unit, "reason": result.error})
+            self._store.add(result)
         if self._on_progress is not None:
             self._on_progress(self.progress())
 
@@ -276,10 +279,11 @@ class _Driver:
         num_groups = len(self._plan.groups)
         while self._waiting:
             same_pair = self._waiting[0] // num_groups == units[-1] // num_groups
-            if len(units) >= size and not same_pair:
+            if len(units) >= size and not (same_pair and len(units) < min(fair, MAX_BATCH)):
                 break
             units.append(self._waiting.popleft())
-        return [self._plan.task(unit) for unit in units]
+        failed = self._store.state.errors
+        return [self._plan.task(unit, 1 + failed.get(unit, {}).get("attempts", 0)) for unit in units]
 
     @contextmanager
     def _stop_on_signals(self) -> Iterator[None]:
@@ -299,7 +303,7 @@ class _Driver:
             yield
         finally:
             for number, handler in previous.items():
-                signal.signal(number, handler)
+                signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 class WorkerDiedError(RuntimeError):
@@ -319,5 +323,13 @@ def _environment(engine: str, num_workers: int | None, shard: tuple[int, int]) -
         "engine": engine,
         "num_workers": num_workers,
         "shard": list(shard),
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "versions": {name: _version(name) for name in PACKAGES},
     }
+
+
+def _version(package: str) -> str | None:
+    """None where another package stands in for it."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -32,6 +32,8 @@ from tensor_stereo.sweeps.journal import append, enter, is_open_elsewhere, open_
 from tensor_stereo.sweeps.units import UnitResult
 
 LOG = logging.getLogger(__name__)
+_MAX_ROWS = 20_000  # that wait for their part, about 80 MB; a hundred matches weigh as much as a row
+_FOLDERS = ("metrics", "matches")
 METRICS_SCHEMA: dict[str, Any] = {
     "unit": pl.Int32,  # number of the unit in the plan
     **ROW_SCHEMA,
@@ -94,6 +96,7 @@ class RunStore:
         self._units_per_part = units_per_part
         self._seconds_per_part = seconds_per_part
         self._pending: list[UnitResult] = []
+        self._num_rows = 0
         self._flushed_at = time.monotonic()
         out.mkdir(parents=True, exist_ok=True)
         with run_lock(out):
@@ -101,8 +104,8 @@ class RunStore:
             self._journal = open_journal(out, shard)
             try:
                 self.state = read_journals(out, verify=verify)
-                self._number = 1 + max(map(_part_number, out.glob(f"*/part-{self._name}-*")), default=0)
-                _set_aside_unlisted(out, set(self.state.files), self._name)
+                self._number = 1 + max((_part_number(name) for name in _part_names(out) | self.state.names), default=0)
+                _set_aside_unlisted(out, self._name)
                 self._write_errors()
             except BaseException:
                 self._journal.close()
@@ -124,8 +127,9 @@ class RunStore:
             OSError: if the part cannot be written; its results are kept and go with the next one.
         """
         self._pending.append(result)
+        self._num_rows += len(result.rows) + (0 if result.matches is None else len(result.matches["trial"]) // 100)
         is_old = time.monotonic() - self._flushed_at > self._seconds_per_part
-        if is_old or len(self._pending) >= self._units_per_part:
+        if is_old or len(self._pending) >= self._units_per_part or self._num_rows > _MAX_ROWS:
             self.flush()
 
     def flush(self) -> None:
@@ -147,10 +151,11 @@ class RunStore:
         errors = [{"unit": r.unit, **(r.error or {}), "attempts": r.attempt} for r in failed]
         entry = {"files": files, "done": [result.unit for result in good], "errors": errors}
         append(entry, self._journal)
+        self._pending.clear()
         failed_before = dict(self.state.errors)
         enter(entry, self.state)
         self._number += 1
-        self._pending.clear()
+        self._num_rows = 0
         self._flushed_at = time.monotonic()
         if self.state.errors != failed_before:
             with run_lock(self.out):
@@ -208,7 +213,8 @@ def _claim(out: Path, config: dict[str, Any], manifest: pl.DataFrame) -> None:
             change = _first_difference(known, config, "")
             raise ValueError(f"out: {out} holds results of other settings: {change}; name another folder")
         return
-    others = {entry.name for entry in out.iterdir()} - {".lock", "manifest.parquet"}  # these two come first
+    names = {entry.name for entry in out.iterdir() if not entry.name.startswith(".")}
+    others = names - {"manifest.parquet"}  # it comes first, so it is what a start that was killed leaves
     if others:
         raise ValueError(f"out: {out} is no run, but holds {min(others)}; name another folder")
     _write_table(manifest, out / "manifest.parquet")
@@ -229,18 +235,29 @@ def _first_difference(known: Any, given: Any, name: str) -> str:
     return f"{name} is {known!r} there, {given!r} here"
 
 
-def _set_aside_unlisted(out: Path, listed: set[str], shard: str) -> None:
+def _set_aside_unlisted(out: Path, shard: str) -> None:
     """Rename parts that no journal lists, as after a crash before the entry: their units are done again."""
-    for path in out.glob("*/*part-*"):
-        owner = path.name.split("part-", 1)[1].rsplit("-", 1)[0]
-        if path.relative_to(out).as_posix() in listed or (owner != shard and is_open_elsewhere(out, owner)):
-            continue
+    unlisted = [name for name in _part_names(out) if _owner(name) == shard or not is_open_elsewhere(out, _owner(name))]
+    listed = read_journals(out).files  # read after a look at the locks: who has ended since has entered its part
+    for name in unlisted:
+        path = out / name
         if path.name.startswith("."):
             path.unlink()  # half a file
-        elif path.suffix == ".parquet":
+        elif path.suffix == ".parquet" and name not in listed:
             path.rename(path.with_suffix(".parquet.unlisted"))
-            LOG.warning("%s is in no journal and was set aside", path.name)
+            LOG.warning("%s is in no journal, or damaged, and was set aside", name)
 
 
-def _part_number(path: Path) -> int:
-    return int(path.name.split(".")[0].rsplit("-", 1)[1])
+def _part_names(out: Path) -> set[str]:
+    """Paths of all parts, of what is left of them, and of those under way."""
+    found = [path for folder in _FOLDERS for path in (out / folder).glob("*part-*-of-*-*.parquet*")]
+    return {path.relative_to(out).as_posix() for path in found}
+
+
+def _owner(name: str) -> str:
+    """The shard that a part is of."""
+    return name.rsplit("part-", 1)[1].rsplit("-", 1)[0]
+
+
+def _part_number(name: str) -> int:
+    return int(name.rsplit("-", 1)[1].split(".")[0])

@@ -79,7 +79,8 @@ def limit_threads() -> None:
 
 def _run_unit(config: SweepConfig, task: Task, runner: TrialRunner) -> UnitResult:
     rows, tables = [], []
-    origin = {"host": platform.node(), "attempt": task.attempt}
+    names = {"dataset": task.files.dataset, "scene": task.files.scene}  # as the manifest has them
+    origin = names | {"host": platform.node(), "attempt": task.attempt}
     for number in task.trials:
         trial = runner.run(config.trials[number])
         rows.append({"unit": task.unit, "trial": number} | trial.row() | origin)

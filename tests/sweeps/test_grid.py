@@ -74,6 +74,8 @@ def test_seeds_count_where_something_is_random() -> None:
         ("[grid]\nfast = 3", ["fast must be a table"]),
         ("[grid]\noutlier_rate = 1.5", ["outlier_rate", "1.5"]),
         ("[grid]\nnoise_px = nan", ["noise_px", "nan"]),
+        ("[grid]\nthreshold = nan", ["threshold", "nan"]),
+        ("[grid]\nmin_group_size = 3000000000", ["min_group_size", "32 bits"]),
         ("detector = 'fast'", ["detector", "above the tables"]),
         ("export_matches = 1", ["export_matches"]),
         ("[[grid]]\n[[grid]]\nseed = -1", ["grid 2", "seed", "-1"]),

@@ -46,7 +46,8 @@ def test_a_sweep_stores_the_rows_of_score_dataset(inputs: Inputs, expected: pl.D
 def test_workers_shards_limits_and_parts_change_nothing(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
     out = tmp_path / "run"
     run_sweep(inputs.config, inputs.manifest, out, num_workers=1, shard=(2, 3), units_per_part=1)
-    run_sweep(inputs.config, inputs.manifest, out, num_workers=2, shard=(1, 3), limit=2)
+    state = run_sweep(inputs.config, inputs.manifest, out, num_workers=2, shard=(1, 3), limit=2).progress
+    assert (state.num_units, state.num_done, state.num_new) == (4, 2, 2)
     assert len(read_results(out)) == len(expected) // 2
     for shard in ((1, 3), (3, 3)):
         run_sweep(inputs.config, inputs.manifest, out, num_workers=1, shard=shard, seconds_per_part=0.0)
@@ -85,6 +86,19 @@ def test_kept_matches_come_back_for_training(inputs: Inputs, tmp_path: Path) -> 
         assert torch.equal(found.score, ts.DelaunayFilter()(found.matches).score)
     with pytest.raises(ValueError, match="trial 7"):
         read_matches(out, "synthetic", "synthetic-00", trial=7)
+
+
+def test_scenes_that_look_like_paths_keep_their_matches_apart(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "pairs", 2)
+    listed = tmp_path / "pairs" / "ds.csv"
+    files = [f"synthetic-0{k}-0.png,synthetic-0{k}-1.png,synthetic-0{k}.pfm" for k in range(2)]
+    listed.write_text(f"scene,image0,image1,disparity_gt\nx,{files[0]}\nds/x,{files[1]}\n")
+    config = SweepConfig(expand_grid([{"detector": "fast"}]), export_matches=True)
+    run_sweep(config, make_manifest(listed), tmp_path / "run", num_workers=1)
+    counts = {row["scene"]: row["num_matches"] for row in read_results(tmp_path / "run").iter_rows(named=True)}
+    assert counts.keys() == {"x", "ds/x"}
+    for scene, count in counts.items():
+        assert read_matches(tmp_path / "run", "ds", scene).matches.num_matches == count
 
 
 def test_a_run_without_matches_says_so(inputs: Inputs, tmp_path: Path) -> None:
@@ -154,6 +168,7 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
             "image0": ["a.png"] * count,
             "image1": ["b.png"] * count,
             **dict.fromkeys(["disparity_gt", "disparity_noc_gt", "mask", "calibration", "gt_scale"]),
+            "gt_encoding": ["scaled"] * count,
             "width_px": [1] * count,
             "height_px": [1] * count,
         },

@@ -128,6 +128,71 @@ def test_a_later_success_replaces_an_error(tmp_path: Path) -> None:
     assert _units(out) == [0, 2]
 
 
+def test_a_success_counts_whichever_journal_tells_it(tmp_path: Path) -> None:
+    """A unit fails in an array of jobs, and is good in one process whose journal comes first by name."""
+    out = tmp_path / "run"
+    with _open(out, shard=(2, 4)) as store:
+        store.add(_bad(1))
+    with _open(out) as store:
+        assert store.state.errors.keys() == {1}
+        store.add(_good(1))
+    with _open(out) as store:
+        assert store.state.good == store.state.done == {1}
+    assert _units(out) == [1]
+    assert read_errors(out).is_empty()
+
+
+def test_damage_to_a_unit_that_failed_before_does_it_again(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    for result in (_bad(0), _good(0)):
+        with _open(out) as store:
+            store.add(result)
+    part = next((out / "metrics").iterdir())
+    part.write_bytes(part.read_bytes()[:-1])
+    with _open(out) as store:
+        assert store.state.done == set()
+
+
+def test_a_part_never_takes_the_name_of_another(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_good(1))
+    next((out / "metrics").iterdir()).unlink()
+    for unit in (2, 1):
+        with _open(out) as store:
+            assert unit not in store.state.done
+            store.add(_good(unit))
+    assert _units(out) == [1, 2]
+
+
+def test_a_start_that_was_killed_leaves_a_folder_that_can_be_used(tmp_path: Path) -> None:
+    for name in (".lock", ".4711.manifest.parquet", "manifest.parquet", ".4711.config.json"):
+        (tmp_path / name).touch()
+    with _open(tmp_path) as store:
+        store.add(_good(0))
+    assert _units(tmp_path) == [0]
+
+
+def test_files_of_others_stay(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with _open(out) as store:
+        store.add(_good(0))
+    (out / "plots").mkdir()
+    mine = [out / "plots" / "part-1-of-1-000003.parquet", out / "plots" / ".part-1-of-1-000003.parquet"]
+    for path in mine:
+        path.touch()
+    with _open(out):
+        assert all(path.exists() for path in mine)
+
+
+def test_many_rows_make_a_part_of_their_own(tmp_path: Path) -> None:
+    wide = dict.fromkeys(METRICS_SCHEMA)
+    with _open(tmp_path / "run") as store:
+        for unit in range(3):
+            store.add(UnitResult(unit, [wide | {"unit": unit, "trial": k} for k in range(15_000)]))
+    assert len(list((tmp_path / "run" / "metrics").iterdir())) == 2
+
+
 def test_another_configuration_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with _open(out) as store:

@@ -12,6 +12,7 @@
 #include <utility>
 
 #include "tensor_stereo/buffer.hpp"
+#include "tensor_stereo/consensus_belief.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
 #include "tensor_stereo/dual_edge_ratio.hpp"
 #include "tensor_stereo/gated_ssd.hpp"
@@ -70,9 +71,9 @@ auto give_pattern(ts::SparsePattern graph) {
     return std::pair(give(std::move(graph.crow), graph.num_rows + 1), give(std::move(graph.cols), num_entries));
 }
 
-void check_index(const Integers& index, std::int64_t num_points) {
+void check_index(const Integers& index, std::int64_t num_points, const char* message = "index must name rows of points") {
     for (std::size_t k = 0; k < index.shape(0); ++k) {
-        check(index.data()[k] >= 0 && index.data()[k] < num_points, "index must name rows of points");
+        check(index.data()[k] >= 0 && index.data()[k] < num_points, message);
     }
 }
 
@@ -240,6 +241,37 @@ auto row_overlap(Integers crow0, Integers cols0, Integers crow1, Integers cols1,
                       give(std::move(degree1), num_rows));
 }
 
+auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::optional<Doubles> cost, Integers crow0,
+                      Integers cols0, Integers crow1, Integers cols1, double tolerance, double whole_tolerance,
+                      std::optional<double> row_tolerance, double whole_row_tolerance, double slope, double reach,
+                      double doubt, double cost_weight, int num_rounds, int num_threads) {
+    const std::size_t num_matches = keypoints0.shape(0);
+    const auto num_rows = static_cast<std::int64_t>(num_matches);
+    check(keypoints1.shape(0) == num_matches, "keypoints0 and keypoints1 must have the same length");
+    check(!cost || cost->shape(0) == num_matches, "cost must have one entry per match");
+    check_offsets(ptr, num_rows, "ptr must rise from 0 to the number of matches");
+    check(crow0.shape(0) == num_matches + 1 && crow1.shape(0) == num_matches + 1, "crow must have one row per match");
+    check_offsets(crow0, static_cast<std::int64_t>(cols0.shape(0)), "crow0 must rise from 0 to the length of cols0");
+    check_offsets(crow1, static_cast<std::int64_t>(cols1.shape(0)), "crow1 must rise from 0 to the length of cols1");
+    check_index(cols0, num_rows, "cols0 must name matches");
+    check_index(cols1, num_rows, "cols1 must name matches");
+    check(num_rounds >= 0, "num_rounds must not be negative");
+    auto belief = ts::allocate<double>(num_matches);
+    {
+        const nb::gil_scoped_release release;
+        ts::consensus_belief({{keypoints0.data(), keypoints1.data()},
+                              ptr.data(),
+                              static_cast<std::int64_t>(ptr.shape(0)) - 1,
+                              cost ? cost->data() : nullptr,
+                              {crow0.data(), crow1.data()},
+                              {cols0.data(), cols1.data()}},
+                             {tolerance, whole_tolerance, row_tolerance, whole_row_tolerance, slope, reach, doubt,
+                              cost_weight, num_rounds},
+                             num_threads, belief.get());
+    }
+    return give(std::move(belief), num_matches);
+}
+
 auto relate(Integers overlap, Integers degree0, Integers degree1, Integers group_size, std::int64_t min_group_size,
             bool accept_subsets) {
     const std::size_t count = overlap.shape(0);
@@ -342,6 +374,11 @@ NB_MODULE(_kernels, module) {
                nb::arg("bound"), nb::arg("num_threads"));
     module.def("row_overlap", &row_overlap, nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
                nb::arg("num_threads"));
+    module.def("consensus_belief", &consensus_belief, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("ptr"),
+               nb::arg("cost").none(), nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
+               nb::arg("tolerance"), nb::arg("whole_tolerance"), nb::arg("row_tolerance").none(),
+               nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"), nb::arg("doubt"),
+               nb::arg("cost_weight"), nb::arg("num_rounds"), nb::arg("num_threads"));
     module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),
                nb::arg("min_group_size"), nb::arg("accept_subsets"));
     module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from tensor_stereo.evaluation import score_dataset as score_dataset
     from tensor_stereo.filters import classify_matches as classify_matches
     from tensor_stereo.graphs import build_graphs as build_graphs
+    from tensor_stereo.interpolation import interpolate_disparity as interpolate_disparity
     from tensor_stereo.modules import DelaunayFilter as DelaunayFilter
     from tensor_stereo.types import Adjacency as Adjacency
     from tensor_stereo.types import Classification as Classification
@@ -30,6 +31,7 @@ _HOMES = {
     "StereoPair": "types",
     "build_graphs": "graphs",
     "classify_matches": "filters",
+    "interpolate_disparity": "interpolation",
     "score_dataset": "evaluation",
 }
 

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
 TemperatureUnit = Literal["edge", "px"]
-ScoreName = Literal["none", "topology"]
+ScoreName = Literal["none", "topology", "consensus", "learned"]
 Backend = Literal["auto", "native", "scipy"]
 
 RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
@@ -87,6 +87,28 @@ class ClassifyConfig:
 
 
 @dataclass(frozen=True)
+class ConsensusConfig:
+    """Settings of the consensus score, of what the neighbours of a match believe.
+
+    Two of them have a second value for keypoints on whole pixels, whose rounding is larger than the errors of sub-pixel
+    keypoints; what lies between is interpolated. Which keypoints are given is measured, pair by pair.
+    """
+
+    tolerance_px: float = 0.6  # difference to a neighbour's plane at which agreement has fallen to exp(-1/2)
+    whole_tolerance_px: float = 1.0
+    row_tolerance_px: float | None = 0.25  # row offset that halves the odds; None: the pair is not rectified
+    whole_row_tolerance_px: float = 1.5
+    slope: float = 0.2  # expected change of the displacement per px of distance, px/px
+    reach: float = 2.0  # distance, in edge lengths around the match, at which a neighbour's vote counts half
+    doubt: float = 1.0  # votes against every match, so that few votes are less than many
+    cost_weight: float = 0.5  # log-odds per standard deviation of the logarithm of the cost
+    num_rounds: int = 2
+
+
+UNRECTIFIED = ConsensusConfig(row_tolerance_px=None)  # for pairs of any two views
+
+
+@dataclass(frozen=True)
 class StepConfigs(ClassifyConfig):
     """Settings of all steps, whichever detector runs."""
 
@@ -113,8 +135,8 @@ class TrialConfig(PipelineConfig):
     outlier_rate: float = 0.0  # fraction of the matches whose partners in view 1 change places among them
     noise_px: float = 0.0  # standard deviation added to x and y of both keypoints
     seed: int = 0  # of outliers and noise, together with the name of the pair
-    score: ScoreName = "topology"  # none: no score, and no curve in the results
-    temperature: float = 1.0  # of the score
+    score: ScoreName = "consensus"  # none: no score, and no curve in the results
+    temperature: float = 1.0  # of the score topology
     temperature_unit: TemperatureUnit = "edge"
     threshold: float | None = None  # verdict by score >= threshold instead of by restriction
     max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more

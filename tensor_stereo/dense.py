@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.configs import ConsensusConfig
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.types import Matches
@@ -48,7 +49,8 @@ def filter_disparity(
         disparity: (B, 1, H, W) float32 or float64, x0 - x1 in px, of any sign. NaN and infinite values are no matches,
             nor are those whose partner lies outside columns 0..W - 1.
         stride: distance of the grid's points in px, at least 1. The grid starts at pixel (0, 0).
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()``.
+        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()`` whose
+            consensus does not weigh the cost, which is less for nearer pixels so that they win where two meet.
         mask: (B, 1, H, W) bool; where it is False, disparities are no matches. None means all.
 
     Returns:
@@ -95,7 +97,9 @@ def filter_disparity(
     keypoints0 = grid.expand(*found.shape, 2)[found]
     keypoints1 = torch.stack([keypoints0[:, 0] - values, keypoints0[:, 1]], dim=1)
     ptr = lengths_to_ptr(found.sum((1, 2)))
-    output = (DelaunayFilter() if filter is None else filter)(Matches(keypoints0, keypoints1, ptr, -values.detach()))
+    # the cost says which of two pixels at one partner counts, and nothing of right and wrong
+    classify = filter or DelaunayFilter(consensus=ConsensusConfig(cost_weight=0.0))
+    output = classify(Matches(keypoints0, keypoints1, ptr, -values.detach()))
     inlier = torch.zeros_like(found).masked_scatter(found, output.inlier)
     score = torch.zeros_like(found, dtype=output.score.dtype).masked_scatter(found, output.score)
     return FilteredDisparity(inlier[:, None], score[:, None], found[:, None], grid)

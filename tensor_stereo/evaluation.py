@@ -35,7 +35,7 @@ ROW_SCHEMA: dict[str, Any] = {
     "noise_px": pl.Float64,
     "seed": pl.Int64,
     "score": pl.String,
-    "temperature": pl.Float64,  # null without score
+    "temperature": pl.Float64,  # of the score topology, else null
     "temperature_unit": pl.String,
     "threshold": pl.Float64,  # null: the verdict is that of the restriction
     "num_matches": pl.Int64,

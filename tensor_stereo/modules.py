@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded
-from tensor_stereo.configs import Backend, Restriction, TemperatureUnit
+from tensor_stereo.configs import Backend, ConsensusConfig, Restriction, TemperatureUnit
 from tensor_stereo.filters import FilterOutput, check_verdict, classify_graphs
+from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.ops.segments import check_options
+from tensor_stereo.scores.consensus import check_consensus, consensus_score
+from tensor_stereo.scores.evidence import ImageEvidence
+from tensor_stereo.scores.learned import score_learned
 from tensor_stereo.soft import (
     COLDEST,
     HOTTEST,
-    SoftGraphs,
     build_soft_graphs,
     check_temperature,
     count_soft_neighbors,
     soft_jaccard,
 )
-from tensor_stereo.types import Classification, Matches, Relation, check_unit
+from tensor_stereo.types import Matches, Relation, check_unit
 
+SCORES = ("topology", "consensus", "learned")
 UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
 
 
@@ -30,11 +35,15 @@ class DelaunayFilter(nn.Module):
 
     Args:
         restriction: of the verdict, as in :func:`tensor_stereo.classify_matches`.
-        score: ``topology``, how far the neighbours of a match agree: the soft Jaccard index of both neighbour sets,
-            which is 1 iff Restriction 1 holds.
-        temperature: below which dual Voronoi edges are hardly told from ties.
+        score: ``consensus``, how far the believed neighbours of a match predict its displacement
+            (:func:`tensor_stereo.scores.consensus.consensus_score`); ``learned``, the calibrated probability of a small
+            network (:func:`tensor_stereo.scores.learned.score_learned`), best with the evidence of the images;
+            ``topology``, how far both neighbour sets agree: their soft Jaccard index, 1 iff Restriction 1 holds.
+        consensus: settings of that score; None means the defaults, for rectified pairs.
+        temperature: of ``topology``: below which dual Voronoi edges are hardly told from ties.
         unit: ``edge``: in lengths of the edge at hand, so that the score does not depend on scale; ``px``: in pixels.
-        learnable_temperature: whether the temperature is a parameter (its logarithm is what is learnt).
+        learnable_temperature: whether the temperature is a parameter (its logarithm is what is learnt); for
+            ``topology``.
         threshold: verdict by score >= threshold instead of by ``restriction``.
         straight_through: the score is the verdict, with the gradient of the soft score.
         min_group_size: as in :func:`tensor_stereo.classify_matches`.
@@ -50,7 +59,7 @@ class DelaunayFilter(nn.Module):
         >>> left = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(0)) * 100
         >>> right = left - torch.tensor([5.0, 0.0])
         >>> output = DelaunayFilter()(left, right)
-        >>> output.inlier.all(), output.score.min() > 0.999
+        >>> output.inlier.all(), output.score.min() > 0.7
         (tensor(True), tensor(True))
     """
 
@@ -60,7 +69,8 @@ class DelaunayFilter(nn.Module):
         self,
         *,
         restriction: Restriction = "cardinality",
-        score: str = "topology",
+        score: Literal["topology", "consensus", "learned"] = "consensus",
+        consensus: ConsensusConfig | None = None,
         temperature: float = 1.0,
         unit: TemperatureUnit = "edge",
         learnable_temperature: bool = False,
@@ -72,8 +82,12 @@ class DelaunayFilter(nn.Module):
     ) -> None:
         super().__init__()
         check_verdict(restriction, min_group_size)
-        if score != "topology":
-            raise ValueError(f"score must be 'topology', got {score!r}")
+        if score not in SCORES:
+            raise ValueError(f"score must be one of {', '.join(SCORES)}, got {score!r}")
+        if learnable_temperature and score != "topology":
+            raise ValueError(f"learnable_temperature must be False where score is {score!r}, which has no temperature")
+        self.consensus = ConsensusConfig() if consensus is None else consensus
+        check_consensus(self.consensus)
         check_unit(unit)
         check_temperature(temperature)
         check_options(tie_tolerance, backend)
@@ -110,6 +124,8 @@ class DelaunayFilter(nn.Module):
         mask: Tensor | None = None,
         group: Tensor | None = None,
         cost: Tensor | None = None,
+        *,
+        evidence: ImageEvidence | None = None,
     ) -> FilterOutput:
         """Classify and score padded pairs, or a ragged batch given as the only argument.
 
@@ -118,12 +134,14 @@ class DelaunayFilter(nn.Module):
             keypoints1: (B, N, 2) px of view 1; row i of both is one match.
             mask: (B, N) bool, True for real matches; None means all. The padding may hold anything.
             group: (B, N) integer object groups.
-            cost: (B, N), lower is better; decides between duplicates.
+            cost: (B, N), lower is better; decides between duplicates, and is evidence for consensus and learned.
+            evidence: what the images say of the rows of ``Matches``, for learned:
+                :func:`tensor_stereo.scores.evidence.measure_images`.
 
         Returns:
             ``inlier``, ``score`` and ``relation`` in the layout of the input. The score has the dtype of the keypoints,
-            under autocast that of autocast. Gradients flow from it to both keypoints and the temperature, and are zero
-            for untested matches; not differentiable twice.
+            under autocast that of autocast. Gradients flow from it to both keypoints (and the temperature, and for
+            consensus the cost), and are zero for untested matches; topology is not differentiable twice.
 
         Raises:
             ValueError: if shapes disagree, or as :func:`tensor_stereo.classify_matches`.
@@ -134,7 +152,9 @@ class DelaunayFilter(nn.Module):
             rest = {"keypoints1": keypoints1, "mask": mask, "group": group, "cost": cost}
             for name in (name for name, value in rest.items() if value is not None):
                 raise TypeError(f"{name} must be part of the Matches, not given beside them")
-            return FilterOutput(*self._classify(keypoints0), keypoints0)
+            return FilterOutput(*self._classify(keypoints0, evidence), keypoints0)
+        if evidence is not None:
+            raise TypeError("evidence must be that of Matches, got padded keypoints")
         mask = _check_padded(keypoints0, keypoints1, mask, group, cost)
         rows0, ptr = from_padded(keypoints0, mask)
         rows1, cost, group = (None if v is None else from_padded(v, mask)[0] for v in (keypoints1, cost, group))
@@ -142,16 +162,16 @@ class DelaunayFilter(nn.Module):
         inlier, score, relation = (_spread(rows, mask) for rows in self._classify(matches))
         return FilterOutput(inlier, score, relation, matches, mask)
 
-    def _classify(self, matches: Matches) -> tuple[Tensor, Tensor, Tensor]:
+    def _classify(self, matches: Matches, evidence: ImageEvidence | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """inlier, score and relation of every match."""
-        found = build_soft_graphs(
-            matches, self.temperature, unit=self.unit, tie_tolerance=self.tie_tolerance, backend=self.backend
-        )
+        if evidence is not None and self.score != "learned":
+            raise TypeError(f"evidence must be None where score is {self.score!r}, which looks at no image")
+        score, graphs = self._score(matches, evidence)
         verdict = classify_graphs(
-            found.graphs, restriction=self.restriction, min_group_size=self.min_group_size, backend=self.backend
+            graphs, restriction=self.restriction, min_group_size=self.min_group_size, backend=self.backend
         )
-        score = self._score(matches, found, verdict)
         is_tested = verdict.relation != UNTESTED
+        score = torch.where(is_tested, score, torch.zeros_like(score))
         device = matches.keypoints0.device.type
         low = torch.is_autocast_enabled(device)
         score = score.to(torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype)
@@ -160,13 +180,16 @@ class DelaunayFilter(nn.Module):
             score = score + (inlier.to(score.dtype) - score).detach()
         return inlier, score, verdict.relation
 
-    def _score(self, matches: Matches, found: SoftGraphs, verdict: Classification) -> Tensor:
-        """(M,) float64."""
-        counts = count_soft_neighbors(
-            matches, found, self.temperature, unit=self.unit, tie_tolerance=self.tie_tolerance, backend=self.backend
-        )
-        score = soft_jaccard(counts)
-        return torch.where(verdict.relation == UNTESTED, torch.zeros_like(score), score)
+    def _score(self, matches: Matches, evidence: ImageEvidence | None) -> tuple[Tensor, MatchGraphs]:
+        """(M,) score of every vertex, and the hard graphs."""
+        if self.score == "topology":
+            options: dict[str, Any] = {"unit": self.unit, "tie_tolerance": self.tie_tolerance, "backend": self.backend}
+            found = build_soft_graphs(matches, self.temperature, **options)
+            return soft_jaccard(count_soft_neighbors(matches, found, self.temperature, **options)), found.graphs
+        graphs = build_match_graphs(matches, tie_tolerance=self.tie_tolerance, backend=self.backend)
+        if self.score == "consensus":
+            return consensus_score(matches, graphs, self.consensus, backend=self.backend), graphs
+        return score_learned(matches, graphs, evidence), graphs
 
 
 def _check_padded(

@@ -19,6 +19,7 @@ from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.perturbation import add_noise, inject_outliers
 from tensor_stereo.pipeline import Stopwatch, detect_pairs, matching_settings, to_gray_pairs
+from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
 STAGES = ("detect", "match", "perturb", "group", "graph", "relate", "score")
@@ -78,8 +79,8 @@ class Trial:
             "noise_px": config.noise_px,
             "seed": config.seed,
             "score": config.score,
-            "temperature": None if self.score is None else config.temperature,
-            "temperature_unit": None if self.score is None else config.temperature_unit,
+            "temperature": config.temperature if config.score == "topology" else None,
+            "temperature_unit": config.temperature_unit if config.score == "topology" else None,
             "threshold": config.threshold,
             "num_matches": self.matches.num_matches,
             "num_valid": confusion.num_valid,
@@ -201,7 +202,7 @@ class TrialRunner:
             "relate",
             lambda: classify_graphs(graphs, restriction=trial.restriction, min_group_size=trial.min_group_size),
         )
-        score = share("score", lambda: _score(matches, trial))
+        score = share("score", lambda: self._score(matches, graphs, trial))
         if trial.threshold is not None and score is not None:
             tested = verdict.relation != int(Relation.UNTESTED)
             verdict = replace(verdict, inlier=tested & (score >= trial.threshold))
@@ -222,22 +223,23 @@ class TrialRunner:
             return matches, unknown, unknown
         return matches, *matches_against_gt(matches, [self.pair.disparity_gt], max_error_px=trial.max_error_px)
 
+    def _score(self, matches: Matches, graphs: MatchGraphs, trial: TrialConfig) -> Tensor | None:
+        if trial.score == "none":
+            return None
+        scorer = DelaunayFilter(
+            score=trial.score,
+            temperature=trial.temperature,
+            unit=trial.temperature_unit,
+            min_group_size=trial.min_group_size,
+            tie_tolerance=trial.tie_tolerance,
+            backend=trial.backend,
+        )
+        image0, image1 = ([image[0]] for image in self._gray[0])
+        evidence = measure_images(image0, image1, matches, graphs) if trial.score == "learned" else None
+        output: FilterOutput = scorer(matches, evidence=evidence)
+        return output.score
+
 
 def scene_name(pair: StereoPair) -> str:
     """Name of a pair within its dataset, also where a data set of several releases names it ``dataset/scene``."""
     return pair.name.removeprefix(f"{pair.dataset}/")
-
-
-def _score(matches: Matches, trial: TrialConfig) -> Tensor | None:
-    if trial.score == "none":
-        return None
-    scorer = DelaunayFilter(
-        score=trial.score,
-        temperature=trial.temperature,
-        unit=trial.temperature_unit,
-        min_group_size=trial.min_group_size,
-        tie_tolerance=trial.tie_tolerance,
-        backend=trial.backend,
-    )
-    output: FilterOutput = scorer(matches)
-    return output.score

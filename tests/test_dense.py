@@ -99,7 +99,7 @@ def test_verdicts_are_those_of_the_filter_on_the_listed_matches() -> None:
     rows = [row for row in rows if 0 <= row[0] - row[2] <= 89]
     left = torch.tensor([[x, y] for x, y, _ in rows], dtype=torch.float64)
     right = torch.tensor([[x - d, y] for x, y, d in rows], dtype=torch.float64)
-    expected = DelaunayFilter()(Matches(left, right, torch.tensor([0, len(rows)])))
+    expected = DelaunayFilter()(Matches(left, right, torch.tensor([0, len(rows)])))  # without costs
     assert 0 < int(expected.inlier.sum()) < len(rows)
     assert torch.equal(result.inlier[result.mask], expected.inlier)
     assert torch.equal(result.score[result.mask], expected.score)

@@ -133,7 +133,7 @@ def test_threshold_replaces_the_restriction() -> None:
 
 def test_temperature_can_be_learnt() -> None:
     left, right = _padded()
-    module = ts.DelaunayFilter(temperature=0.5, learnable_temperature=True)
+    module = ts.DelaunayFilter(score="topology", temperature=0.5, learnable_temperature=True)
     optimizer = torch.optim.SGD(module.parameters(), lr=0.01)
     before = module(left, right).score.mean()
     before.neg().backward()
@@ -145,12 +145,12 @@ def test_temperature_can_be_learnt() -> None:
 
 def test_state_survives_saving_copying_and_pickling() -> None:
     left, right = _padded()
-    module = ts.DelaunayFilter(temperature=0.7, learnable_temperature=True, restriction="adjacency")
+    module = ts.DelaunayFilter(score="topology", temperature=0.7, learnable_temperature=True, restriction="adjacency")
     expected = module(left, right)
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     file.seek(0)
-    restored = ts.DelaunayFilter(learnable_temperature=True, restriction="adjacency")
+    restored = ts.DelaunayFilter(score="topology", learnable_temperature=True, restriction="adjacency")
     restored.load_state_dict(torch.load(file, weights_only=True))
     for other in (restored, copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
         assert torch.equal(other(left, right).score, expected.score)
@@ -190,9 +190,9 @@ def test_inliers_feed_the_next_filter() -> None:
 def test_unrectified_pairs_and_negative_disparities_are_like_any_other() -> None:
     left, right = (points.double() for points in _padded())
     turn = torch.tensor([[0.8, 0.6], [-0.6, 0.8]], dtype=torch.float64)
-    expected = ts.DelaunayFilter()(left, right)
+    expected = ts.DelaunayFilter(score="topology")(left, right)
     for moved in (right + torch.tensor([50.0, 0.0]), right @ turn * 1.5, right.flip(-1)):
-        output = ts.DelaunayFilter()(left, moved)
+        output = ts.DelaunayFilter(score="topology")(left, moved)
         assert torch.equal(output.inlier, expected.inlier)
         assert torch.allclose(output.score, expected.score, atol=1e-9)
 
@@ -211,7 +211,7 @@ def test_the_module_compiles_with_inductor() -> None:
 
 def _compare_compiled(backend: str, learnable: bool) -> None:
     torch.compiler.reset()
-    module = ts.DelaunayFilter(learnable_temperature=learnable)
+    module = ts.DelaunayFilter(score="topology" if learnable else "consensus", learnable_temperature=learnable)
 
     def loss(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         output = module(left, right)
@@ -277,6 +277,9 @@ def test_arguments_that_do_not_fit_together_are_refused() -> None:
 
 
 def test_a_move_to_another_dtype_keeps_the_temperature() -> None:
-    for module in (ts.DelaunayFilter(temperature=3.0), ts.DelaunayFilter(temperature=3.0, learnable_temperature=True)):
+    for module in (
+        ts.DelaunayFilter(score="topology", temperature=3.0),
+        ts.DelaunayFilter(score="topology", temperature=3.0, learnable_temperature=True),
+    ):
         assert module.half().temperature.item() == pytest.approx(3.0, rel=1e-15)
         assert module.temperature.dtype == torch.float64

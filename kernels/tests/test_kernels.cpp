@@ -9,6 +9,7 @@
 #include <utility>
 #include <vector>
 
+#include "expect.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
 #include "tensor_stereo/gated_ssd.hpp"
 #include "tensor_stereo/one_to_one.hpp"
@@ -20,17 +21,12 @@
 
 namespace ts = tensor_stereo;
 
+// In test_consensus_belief.cpp.
+void test_consensus_believes_matches_that_agree();
+void test_consensus_without_neighbours_is_zero();
+void test_consensus_does_not_depend_on_threads_or_batches();
+
 namespace {
-
-int failures = 0;
-
-#define EXPECT(condition)                                                        \
-    do {                                                                         \
-        if (!(condition)) {                                                      \
-            std::fprintf(stderr, "%s:%d: %s\n", __FILE__, __LINE__, #condition); \
-            ++failures;                                                          \
-        }                                                                        \
-    } while (false)
 
 using Rng = std::mt19937_64;
 using Edges = std::set<std::pair<std::int64_t, std::int64_t>>;
@@ -380,6 +376,9 @@ int main() {
         {"critical points leave their side of the circle empty", test_critical_points_leave_their_side_of_the_circle_empty},
         {"soft match graphs do not depend on threads", test_soft_match_graphs_do_not_depend_on_threads},
         {"gradient of soft counts", test_gradient_of_soft_counts_is_that_of_finite_differences},
+        {"consensus believes matches that agree", test_consensus_believes_matches_that_agree},
+        {"consensus without neighbours is zero", test_consensus_without_neighbours_is_zero},
+        {"consensus does not depend on threads or batches", test_consensus_does_not_depend_on_threads_or_batches},
         {"gated SSD takes the lowest index of equals", test_gated_ssd_takes_the_lowest_index_of_equals},
     };
     for (const auto& [name, test] : tests) {

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.types import Matches, check_vector
@@ -137,7 +138,7 @@ class GlueFactoryFilter(nn.Module):
             restriction: adjacency
 
     Args:
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()``.
+        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter(consensus=UNRECTIFIED)``.
 
     Example:
         >>> x, y = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="xy")
@@ -151,7 +152,7 @@ class GlueFactoryFilter(nn.Module):
 
     def __init__(self, filter: Callable[[Matches], FilterOutput] | None = None) -> None:  # noqa: A002 - the slot's name
         super().__init__()
-        self.filter = DelaunayFilter() if filter is None else filter
+        self.filter = DelaunayFilter(consensus=UNRECTIFIED) if filter is None else filter
 
     @classmethod
     def from_conf(cls, conf: Mapping[str, Any]) -> GlueFactoryFilter:

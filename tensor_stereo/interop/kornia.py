@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import batch_to_ptr
+from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.interop.glue_factory import from_glue_factory, to_glue_factory
 from tensor_stereo.modules import DelaunayFilter
@@ -214,7 +215,7 @@ def filter_matches(
         indices: (K, 2) or (K, 3) int64, as for :func:`from_lafs`.
         distances: (K, 1) or (K,) of the matcher, lower is better. They only decide which of several matches of one
             keypoint counts; without them it is the first.
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()``.
+        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter(consensus=UNRECTIFIED)``.
 
     Returns:
         distances (K', 1), which are 1 - score of the filter, so that kornia's confidence, 1 - distance, is that score;
@@ -232,7 +233,9 @@ def filter_matches(
         >>> distances.shape, indices.shape
         (torch.Size([16, 1]), torch.Size([16, 2]))
     """
-    output = (DelaunayFilter() if filter is None else filter)(from_lafs(lafs1, lafs2, indices, distances))
+    output = (DelaunayFilter(consensus=UNRECTIFIED) if filter is None else filter)(
+        from_lafs(lafs1, lafs2, indices, distances)
+    )
     return 1 - output.score[output.inlier][:, None], indices[output.inlier]
 
 
@@ -266,7 +269,7 @@ class FilteredMatcher(nn.Module):
 
     Args:
         matcher: called as ``matcher(desc1, desc2)``; returns distances (K, 1) and indices (K, 2).
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()``.
+        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter(consensus=UNRECTIFIED)``.
 
     Example:
         >>> nearest = lambda desc1, desc2: torch.cdist(desc1, desc2).min(1, keepdim=True)
@@ -286,7 +289,7 @@ class FilteredMatcher(nn.Module):
     ) -> None:
         super().__init__()
         self.matcher = matcher
-        self.filter = DelaunayFilter() if filter is None else filter
+        self.filter = DelaunayFilter(consensus=UNRECTIFIED) if filter is None else filter
 
     def forward(
         self, desc1: Tensor, desc2: Tensor, lafs1: Tensor | None = None, lafs2: Tensor | None = None

@@ -6,7 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from tensor_stereo.atomic import whole_file
-from tensor_stereo.configs import ClassifyConfig
+from tensor_stereo.configs import UNRECTIFIED, ClassifyConfig
 from tensor_stereo.interop.colmap import filter_colmap
 from tensor_stereo.interop.hloc import filter_hloc
 from tensor_stereo.interop.match_tables import filter_table
@@ -45,8 +45,9 @@ def filter_file(
     ============  ==================================================================================================
 
     Verdict and score are those of :class:`~tensor_stereo.DelaunayFilter` on all pairs as one batch, in blocks of
-    bounded size, with coordinates in float64. Pairs with few or no matches are UNTESTED. Files are data only: nothing
-    in them is run, unpickled or taken for a path, and no size in them is believed before it is checked.
+    bounded size, with coordinates in float64; those of ``.h5`` and ``.db`` are not taken to be rectified. Pairs with
+    few or no matches are UNTESTED. Files are data only: nothing in them is run, unpickled or taken for a path, and no
+    size in them is believed before it is checked.
 
     Args:
         source: file of putative matches. It is not changed.
@@ -70,13 +71,14 @@ def filter_file(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     source, out = Path(folder, "matches.csv"), Path(folder, "filtered.csv")
         ...     _ = source.write_text("x0,y0,x1,y1\n0,0,-3,0\n9,1,6,1\n1,8,-2,8\n8,9,5,9\n")
-        ...     filter_file(source, out).num_kept, out.read_text().splitlines()[:2]
-        (4, ['x0,y0,x1,y1,inlier,score,relation', '0,0,-3,0,true,1.0,equal'])
+        ...     filter_file(source, out).num_kept, out.read_text().splitlines()[:2]  # doctest: +ELLIPSIS
+        (4, ['x0,y0,x1,y1,inlier,score,relation', '0,0,-3,0,true,...,equal'])
     """
     ending = _check_files(source, out, keypoints)
     config = ClassifyConfig() if config is None else config
     settings = {field.name: getattr(config, field.name) for field in fields(ClassifyConfig)}
-    run = DelaunayFilter(**settings, threshold=threshold)
+    consensus = UNRECTIFIED if ending in (".h5", ".db") else None  # of any two views, as structure from motion has
+    run = DelaunayFilter(**settings, threshold=threshold, consensus=consensus)
     with whole_file(out) as target:
         if ending == ".npz":
             return filter_npz(source, target, run)

@@ -3,6 +3,7 @@
 from tensor_stereo.ops.backends import BackendInfo as BackendInfo
 from tensor_stereo.ops.backends import backend as backend
 from tensor_stereo.ops.backends import resolve_backend as resolve_backend
+from tensor_stereo.ops.consensus_belief import consensus_belief as consensus_belief
 from tensor_stereo.ops.delaunay_graph import delaunay_graph as delaunay_graph
 from tensor_stereo.ops.delaunay_graph import match_graphs as match_graphs
 from tensor_stereo.ops.dual_critical_points import dual_critical_points as dual_critical_points

@@ -61,8 +61,8 @@ def read_grid(path: Path | str) -> SweepConfig:
 def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
     """The points of a union of products.
 
-    Settings that a point does not use (other detectors, the seed where nothing is random, the temperature without a
-    score, the restriction beside a threshold) are set to their defaults, and equal points are one.
+    Settings that a point does not use (other detectors, the seed where nothing is random, the temperature of another
+    score than topology, the restriction beside a threshold) are set to their defaults, and equal points are one.
 
     Args:
         tables: settings as :func:`read_grid` describes them, nested by their dots.
@@ -100,7 +100,7 @@ def simplify(trial: TrialConfig) -> TrialConfig:
     unused: dict[str, Any] = {name: getattr(_DEFAULT, name) for name in DETECTORS if name != trial.detector}
     if not trial.outlier_rate and not trial.noise_px:
         unused["seed"] = _DEFAULT.seed
-    if trial.score == "none":
+    if trial.score != "topology":
         unused |= {"temperature": _DEFAULT.temperature, "temperature_unit": _DEFAULT.temperature_unit}
     if trial.threshold is not None:
         unused["restriction"] = _DEFAULT.restriction

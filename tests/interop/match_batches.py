@@ -9,6 +9,7 @@ import torch
 
 from tensor_stereo import DelaunayFilter, Matches, classify_matches
 from tensor_stereo.batching import collate_matches
+from tensor_stereo.configs import ConsensusConfig
 from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.matchers import scene
 
@@ -27,9 +28,11 @@ def batch(seed: int, sizes: Sequence[int] = (60, 0, 1, 3, 45), *, has_group: boo
     return collate_matches(items)
 
 
-def expected(matches: Matches, threshold: float | None = None, **settings: object) -> Verdicts:
+def expected(
+    matches: Matches, threshold: float | None = None, consensus: ConsensusConfig | None = None, **settings: object
+) -> Verdicts:
     """Inlier and relation by classify_matches, the score by DelaunayFilter."""
     verdict = classify_matches(matches, **settings)  # type: ignore[arg-type]
-    output = DelaunayFilter(threshold=threshold, **settings)(matches)  # type: ignore[arg-type]
+    output = DelaunayFilter(threshold=threshold, consensus=consensus, **settings)(matches)  # type: ignore[arg-type]
     inlier = verdict.inlier if threshold is None else output.inlier
     return Verdicts(inlier.numpy(), output.score.numpy(), verdict.relation.numpy())

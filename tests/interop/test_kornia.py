@@ -10,6 +10,7 @@ from kornia.feature.loftr.loftr import default_cfg
 from torch import Tensor
 
 from tensor_stereo import DelaunayFilter
+from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.interop.kornia import (
     FilteredMatcher,
     LocatedFeature,
@@ -183,7 +184,7 @@ def test_batched_indices_of_kornia_give_the_pairs_one_by_one() -> None:
 @pytest.mark.parametrize("mode", ["nn", "snn"])
 def test_filter_matches_keeps_the_rows_of_the_inliers(mode: str) -> None:
     lafs1, lafs2, distances, indices = matched_by_snn(1, mode)
-    verdict = DelaunayFilter()(from_lafs(lafs1, lafs2, indices, distances))
+    verdict = DelaunayFilter(consensus=UNRECTIFIED)(from_lafs(lafs1, lafs2, indices, distances))
     kept_distances, kept = filter_matches(lafs1, lafs2, indices, distances=distances)
     assert 0 < len(kept) < len(indices)
     assert torch.equal(kept, indices[verdict.inlier])
@@ -241,7 +242,7 @@ def test_filtered_matcher_in_local_feature_matcher_gives_the_inliers_of_its_plai
     with torch.no_grad():
         plain = kf.LocalFeatureMatcher(feature, matcher)(images)
         filtered = kf.LocalFeatureMatcher(LocatedFeature(feature), FilteredMatcher(matcher))(images)
-    verdict = DelaunayFilter()(from_loftr(plain))
+    verdict = DelaunayFilter(consensus=UNRECTIFIED)(from_loftr(plain))
     expected = to_loftr(plain, verdict.inlier)
     assert filtered.keys() == expected.keys()
     for name in ("keypoints0", "keypoints1", "lafs0", "lafs1", "batch_indexes"):

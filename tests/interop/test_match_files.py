@@ -12,7 +12,7 @@ import pytest
 
 from tensor_stereo import Matches
 from tensor_stereo.batching import ptr_to_batch, split_matches
-from tensor_stereo.configs import ClassifyConfig, PipelineConfig
+from tensor_stereo.configs import UNRECTIFIED, ClassifyConfig, PipelineConfig
 from tensor_stereo.interop import match_files
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.verdicts import Verdicts
@@ -108,12 +108,17 @@ def test_settings_reach_the_filter(tmp_path: Path, ending: str) -> None:
     matches = Matches(*(points.float().double() for points in (matches.keypoints0, matches.keypoints1)), matches.ptr)
     arguments = write_source(tmp_path, ending, matches)
     config = ClassifyConfig(restriction="adjacency", min_group_size=1, tie_tolerance=0.01, backend="scipy")
-    assert_verdicts(arguments["out"], filter_file(**arguments, config=config), expected(matches, **vars(config)))
+    consensus = UNRECTIFIED if ending in (".h5", ".db") else None
+    assert_verdicts(
+        arguments["out"],
+        filter_file(**arguments, config=config),
+        expected(matches, consensus=consensus, **vars(config)),
+    )
     pipeline = PipelineConfig(restriction="adjacency")
     summary = filter_file(**arguments, config=pipeline)
-    assert_verdicts(arguments["out"], summary, expected(matches, restriction="adjacency"))
+    assert_verdicts(arguments["out"], summary, expected(matches, consensus=consensus, restriction="adjacency"))
     summary = filter_file(**arguments, threshold=0.5)  # replaces what is there
-    assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.5))
+    assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.5, consensus=consensus))
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

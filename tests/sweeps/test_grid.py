@@ -26,6 +26,7 @@ def test_lists_make_a_product_and_tables_a_union(tmp_path: Path) -> None:
         [[grid]]
         detector = "sift"
         matching.max_row_offset_px = [1, "none"]
+        score = "topology"
         temperature = 2
         """,
     )

@@ -1,0 +1,209 @@
+"""What a filter buys: dense maps, depth and epipolar geometry from the matches that it keeps."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from accuracy_data import DETECTORS, GrayPair, Putatives, find_putatives, load_pairs, to_matches
+from accuracy_peers import score_disparity, score_lpm
+from dense_figures import draw_bars, draw_maps
+from harness import Suite
+
+import tensor_stereo as ts
+from tensor_stereo.datasets import find_pairs, read_calibration
+from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.interpolation import interpolate_disparity
+from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.evidence import measure_images
+from tensor_stereo.scores.learned import score_learned
+
+BAD_PX = 2.0
+MAX_STEP_PX = 4.0  # where triangles are cut; of 2, 4, 8 and 16 the best on the training scenes
+NUM_THRESHOLDS = 13  # quantiles of each score over the training scenes
+GRID_PX = 8  # of ground-truth correspondences for the epipolar distance
+RANSAC_ERROR_PX, CONFIDENCE = 1.0, 0.999
+FITS = {"8-point": cv2.FM_8POINT, "LMedS": cv2.FM_LMEDS, "RANSAC": cv2.FM_RANSAC}
+PEERS = ("LPM", "libviso2 support", "disparity median, Delaunay")
+OURS = ("topology", "consensus", "learned")
+SCORES = (*PEERS, *OURS)
+SHOWN_SCENE, SHOWN = "teddy", ("none", "paper R1+R2", "disparity median, Delaunay", "learned", "oracle")
+FILTERS = ("none", "paper R1+R2", *PEERS, *OURS, "learned, 0.5", "oracle")
+
+Rows = np.ndarray  # (M,) bool
+Scored = dict[str, np.ndarray]
+Case = tuple[GrayPair, Putatives, Scored]
+
+
+def score_filters(pair: GrayPair, one: Putatives) -> Scored:
+    """Every score of one pair, and the verdicts without a threshold as scores of 0 and 1."""
+    plain, given = to_matches([one]), to_matches([one], with_cost=True)
+    graphs = build_match_graphs(given)
+    views = ([torch.from_numpy(view)[None]] for view in (pair.left, pair.right))
+    peers = score_disparity(one)
+    ours = {
+        "topology": ts.DelaunayFilter(score="topology")(plain).score,
+        "consensus": consensus_score(given, graphs),
+        "learned": score_learned(given, graphs, measure_images(*views, given, graphs)),
+        "paper R1+R2": ts.classify_matches(plain, min_group_size=1).inlier,
+        "none": torch.ones(plain.num_matches),
+        "oracle": torch.from_numpy(one.correct & one.valid),
+    }
+    ours["learned, 0.5"] = ours["learned"]  # a calibrated probability, taken at its word
+    scores = {name: score.double().numpy() for name, score in ours.items()}
+    return scores | {"LPM": score_lpm(one)} | {name: peers[name] for name in PEERS[1:]}
+
+
+def map_errors(
+    pair: GrayPair, one: Putatives, kept: Rows, max_step_px: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The dense map, 0 without any anchor, and its absolute errors where the ground truth is known."""
+    matches, inlier = to_matches([one]), torch.from_numpy(kept)
+    dense = interpolate_disparity(matches, one.size, inlier=inlier, max_step_px=max_step_px)
+    found, truth = dense[0, 0].nan_to_num(0).numpy(), pair.disparity_gt
+    return found, np.abs(found - truth)[is_known(truth)]
+
+
+def is_known(truth: np.ndarray) -> np.ndarray:
+    return np.isfinite(truth) & (truth > 0)
+
+
+def measure_maps(pair: GrayPair, one: Putatives, kept: Rows, max_step_px: float | None = None) -> dict[str, float]:
+    error = map_errors(pair, one, kept, max_step_px)[1]
+    return {"bad2": float((error > BAD_PX).mean()), "epe_px": float(error.mean()), "anchors": float(kept.sum())}
+
+
+def measure_geometry(pair: GrayPair, one: Putatives, kept: Rows) -> dict[str, float]:
+    """Mean symmetric epipolar distance of true correspondences in px, for each way to fit; infinite if it fails."""
+    y, x = (axis.ravel() for axis in np.mgrid[0 : one.size[0] : GRID_PX, 0 : one.size[1] : GRID_PX])
+    disparity = pair.disparity_gt[y, x]
+    known = is_known(disparity)
+    ones = np.ones(int(known.sum()))
+    truth0 = np.stack([x[known], y[known], ones], 1)
+    truth1 = np.stack([x[known] - disparity[known], y[known], ones], 1)
+    views = [np.ascontiguousarray(points[kept]) for points in (one.points0, one.points1)]
+    errors = {}
+    for name, method in FITS.items():
+        cv2.setRNGSeed(0)
+        fitted = None
+        if kept.sum() >= 8:
+            fitted, _ = cv2.findFundamentalMat(*views, method, RANSAC_ERROR_PX, CONFIDENCE)
+        if fitted is None or fitted.shape != (3, 3):
+            errors[name] = np.inf
+            continue
+        line0, line1 = truth1 @ fitted, truth0 @ fitted.T
+        residual = np.abs((truth1 * line1).sum(1))
+        lengths = (np.linalg.norm(line[:, :2], axis=1).clip(1e-12) for line in (line0, line1))
+        errors[name] = float(np.mean([(residual / length).mean() for length in lengths]))
+    return errors
+
+
+def choose_thresholds(cases: list[Case]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """For each score its thresholds (T,) and the bad-2px (S, T) of each scene at each of them."""
+    chosen = {}
+    for name in SCORES:
+        pooled = np.concatenate([scores[name] for *_, scores in cases])
+        thresholds = np.unique(np.quantile(pooled, np.linspace(0, 0.96, NUM_THRESHOLDS)))
+        bad = [[measure_maps(pair, one, s[name] >= t)["bad2"] for t in thresholds] for pair, one, s in cases]
+        chosen[name] = thresholds, np.array(bad)
+    return chosen
+
+
+def keep(scores: Scored, name: str, thresholds: dict[str, float]) -> Rows:
+    return scores[name] >= thresholds.get(name, 0.5)
+
+
+def report(suite: Suite, title: str, table: dict[str, dict[str, np.ndarray]], thresholds: dict[str, float]) -> None:
+    """Print and keep the means over scenes, and what part of the gap to the oracle ours close."""
+    print(title)
+    for name, figures in table.items():
+        middle = {key: float((np.median if key in FITS else np.mean)(values)) for key, values in figures.items()}
+        scenes = {key: values.round(4).tolist() for key, values in figures.items()}
+        suite.records.append({
+            "putatives": title, "filter": name, "threshold": thresholds.get(name), **middle, "scenes": scenes,
+        })  # fmt: skip
+        print(f"  {name:28}" + "  ".join(f"{key} {value:8.3f}" for key, value in middle.items()), flush=True)
+    bad = {name: figures["bad2"].mean() for name, figures in table.items()}
+    peer = min(PEERS, key=bad.__getitem__)
+    for name in (*OURS, "learned, 0.5"):
+        closed = (bad[peer] - bad[name]) / (bad[peer] - bad["oracle"])
+        suite.records.append({"putatives": title, "filter": name, "best_peer": peer, "gap_closed": closed})
+        print(f"  {name:28} closes {closed:+.2f} of the gap from {peer} to the oracle", flush=True)
+
+
+def measure_depth(pair: GrayPair, one: Putatives, kept: Rows, doffs_px: float) -> dict[str, float]:
+    """Error of the depth of the dense map, relative to the true depth."""
+    known = is_known(pair.disparity_gt)
+    found = map_errors(pair, one, kept)[0][known] + doffs_px
+    error = np.abs((pair.disparity_gt[known] + doffs_px) / found.clip(1e-6) - 1)  # depth is a constant / these
+    return {"median": float(np.median(error)), "above_10_percent": float((error > 0.1).mean())}
+
+
+def find_offsets(root: Path) -> dict[str, float]:
+    """Scene -> px between the principal points, for pairs with a calibration."""
+    found = {files.scene: files.image0.parent / "calib.txt" for files in find_pairs(root)}
+    return {scene: read_calibration(file).doffs_px for scene, file in found.items() if file.is_file()}
+
+
+def run(
+    suite: Suite, pairs: dict[str, list[GrayPair]], offsets: dict[str, float], detector: str, gated: bool
+) -> dict[str, dict[str, np.ndarray]]:
+    """Everything about one kind of putative matches; the table of the eight scenes."""
+    title = f"{detector}{', gated' if gated else ''}"
+    found = {g: [find_putatives(pair, detector, gated=gated) for pair in pairs[g]] for g in pairs}
+    cases = {g: [(*case, score_filters(*case)) for case in zip(pairs[g], found[g], strict=True)] for g in pairs}
+    chosen = choose_thresholds(cases["training"])
+    best = {name: float(t[bad.mean(0).argmin()]) for name, (t, bad) in chosen.items()}
+    table = {}
+    for name in FILTERS:
+        rows = []
+        for pair, one, scores in cases["eight"]:
+            kept = keep(scores, name, best)
+            cut = measure_maps(pair, one, kept, MAX_STEP_PX)
+            whole = measure_maps(pair, one, kept) | {"bad2_cut": cut["bad2"], "epe_cut_px": cut["epe_px"]}
+            rows.append(whole | measure_geometry(pair, one, kept))
+        table[name] = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    report(suite, title, table, best)
+    if title == "fast":
+        show_maps(next(case for case in cases["eight"] if case[0].scene == SHOWN_SCENE), best)
+    # The scenes with a calibration are among those that choose the thresholds: here they do not.
+    others = np.array([pair.scene not in offsets for pair in pairs["training"]])
+    best = {name: float(t[bad[others].mean(0).argmin()]) for name, (t, bad) in chosen.items()}
+    for pair, one, scores in (case for case in cases["training"] if case[0].scene in offsets):
+        for name in FILTERS:
+            error = measure_depth(pair, one, keep(scores, name, best), offsets[pair.scene])
+            suite.note(f"depth, {title}, {pair.scene}, {name}", **error)
+    return table
+
+
+def show_maps(case: Case, best: dict[str, float]) -> None:
+    pair, one, scores = case
+    shown = {}
+    for name in SHOWN:
+        kept = keep(scores, name, best)
+        values, error = map_errors(pair, one, kept)
+        shown[name] = values, one.points0[kept], float((error > BAD_PX).mean())
+    draw_maps(pair.scene, np.where(is_known(pair.disparity_gt), pair.disparity_gt, np.nan), shown)
+
+
+@torch.no_grad()
+def main() -> None:
+    suite = Suite("dense")
+    cv2.setNumThreads(1)
+    groups = load_pairs(suite.options.data)
+    pairs = {group: groups[group] for group in ("training", "eight")}
+    offsets = find_offsets(suite.options.data)
+    tables = {}
+    for detector in DETECTORS:
+        for gated in (False, True):
+            title = f"{detector}{', gated' if gated else ''}"
+            tables[title] = run(suite, pairs, offsets, detector, gated)
+    draw_bars(tables)
+    suite.write()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""Operator for the belief in matches that agree with the displacement of their neighbours, with its gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.ops import reference_consensus
+from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.registration import operator
+
+_DIFFERENTIABLE = (0, 1, 3)  # positions of keypoints0, keypoints1 and cost
+_NUM_TENSORS, _NUM_ARGUMENTS = 8, 18
+
+
+def _fake(keypoints0: Tensor, *_: object) -> Tensor:
+    return keypoints0.new_empty(keypoints0.shape[0], dtype=torch.float64)
+
+
+def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001  # named by torch
+    ctx.save_for_backward(*inputs[:_NUM_TENSORS])
+    ctx.settings = inputs[_NUM_TENSORS:-1]
+
+
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    """Repeats the rounds in plain torch, which keeps no intermediate result between forward and backward."""
+    wanted = [k for k in _DIFFERENTIABLE if ctx.needs_input_grad[k]]
+    twice = torch.is_grad_enabled()
+    with torch.enable_grad():
+        arguments = list(ctx.saved_tensors)
+        for k in wanted:  # aliases, so that the second pass ends here
+            arguments[k] = arguments[k].view_as(arguments[k])
+        belief = reference_consensus.consensus_belief(*arguments, *ctx.settings)
+        found = torch.autograd.grad(belief, [arguments[k] for k in wanted], gradient, create_graph=twice)
+    results: list[Tensor | None] = [None] * _NUM_ARGUMENTS
+    for k, result in zip(wanted, found, strict=True):
+        results[k] = result
+    return tuple(results)
+
+
+@operator(_fake, backward=_backward, setup_context=_setup_context)
+def consensus_belief(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    ptr: Tensor,
+    cost: Tensor | None,
+    crow0: Tensor,
+    cols0: Tensor,
+    crow1: Tensor,
+    cols1: Tensor,
+    tolerance_px: float,
+    whole_tolerance_px: float,
+    row_tolerance_px: float | None,
+    whole_row_tolerance_px: float,
+    slope: float,
+    reach: float,
+    doubt: float,
+    cost_weight: float,
+    num_rounds: int,
+    backend: str,
+) -> Tensor:
+    """How likely every match is right, by what its believed neighbours in both views predict.
+
+    The sums of the kernel and of plain torch run in the same order; only transcendental functions may differ, in the
+    last bits.
+
+    Args:
+        keypoints0: (M, 2) float32 or float64 px of view 0.
+        keypoints1: (M, 2) of view 1.
+        ptr: (B + 1,) int64 offsets of the pairs.
+        cost: (M,) floating point, not negative, or None.
+        crow0: (M + 1,) int64 row offsets of the graph of view 0.
+        cols0: (nnz0,) int64 neighbours, of the same pair and distinct from the match in view 0.
+        crow1: (M + 1,), of view 1.
+        cols1: (nnz1,).
+        tolerance_px: this and all that follow are the settings of
+            :class:`tensor_stereo.scores.consensus.ConsensusConfig`.
+        whole_tolerance_px: for keypoints on whole pixels.
+        row_tolerance_px: None: row offsets are no evidence.
+        whole_row_tolerance_px: for keypoints on whole pixels.
+        slope: px/px.
+        reach: in edge lengths.
+        doubt: in votes.
+        cost_weight: in log-odds.
+        num_rounds: 0 gives the beliefs without neighbours.
+        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+
+    Returns:
+        (M,) float64 in [0, 1). Gradients flow to both point sets and the cost: by plain torch, which the backward pass
+        runs anew, so that they may be differentiated again.
+
+    Example:
+        >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])
+        >>> graphs = (crow, torch.tensor([1, 0])) * 2
+        >>> consensus_belief(points, points, ptr, None, *graphs, 0.6, 1.0, None, 1.0, 0.2, 2.0, 1.0, 0.5, 1, "auto")
+        tensor([0.4444, 0.4444], dtype=torch.float64)
+    """
+    tolerances = tolerance_px, whole_tolerance_px, row_tolerance_px, whole_row_tolerance_px
+    settings: tuple[Any, ...] = (*tolerances, slope, reach, doubt, cost_weight, num_rounds)
+    graphs = crow0, cols0, crow1, cols1
+    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+        return reference_consensus.consensus_belief(keypoints0, keypoints1, ptr, cost, *graphs, *settings)
+    result = kernels.consensus_belief(
+        *(_to_float64(keypoints) for keypoints in (keypoints0, keypoints1)),
+        ptr.contiguous().numpy(force=True),
+        None if cost is None else _to_float64(cost),
+        *(tensor.contiguous().numpy(force=True) for tensor in graphs),
+        *settings,
+        torch.get_num_threads(),
+    )
+    return torch.from_numpy(result).to(keypoints0.device)
+
+
+def _to_float64(values: Tensor) -> Any:
+    return values.detach().to("cpu", torch.float64).contiguous().numpy()

@@ -1,0 +1,1 @@
+"""Scores of putative matches beside the paper's verdict: consensus without weights, and a learned one."""

@@ -1,0 +1,256 @@
+"""Learned score: a small network that passes messages over the Delaunay graphs of both views.
+
+Every match starts from its own quantities and, where there are images, from what these say about it. In each of three
+rounds it hears from its neighbours in either view, through what lies between both; in the last it also looks at the
+plane through the neighbours that are believed so far. Costs and images may be missing: training has left them out at
+random, and without them the network adds nothing in their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from tensor_stereo.graphs import MatchGraphs
+from tensor_stereo.scores.evidence import NUM_VALUES, ImageEvidence
+from tensor_stereo.scores.quantities import (
+    NUM_COST,
+    NUM_EDGE,
+    NUM_EDGE_IMAGE,
+    NUM_NODE,
+    Quantities,
+    measure_quantities,
+)
+from tensor_stereo.types import Adjacency, Matches
+
+WEIGHTS = Path(__file__).with_name("weights.safetensors")
+_MATCHES_AT_ONCE = 4096  # whose edges stay in the cache
+_WIDTH, _EDGE_WIDTH, _ROUNDS = 24, 12, 3
+_NUM_PLANE = 9
+_MAX_NORMALIZED = 4.0  # standard deviations
+_RIDGE = 0.3  # squared mean distances to neighbours; flattens planes that too few neighbours hold
+_MAX_GAP_PX = 64.0
+
+
+class LearnedScore(nn.Module):
+    """How likely every match is correct, from the graphs, the costs and the images.
+
+    Without images and costs it is translation invariant as :func:`measure_quantities` is; always, the order of the
+    matches and the other pairs of the batch change nothing but rounding.
+
+    Args:
+        width: of the state of a match.
+        edge_width: of a message.
+        num_rounds: of messages.
+    """
+
+    calibration: Tensor  # (2,) slope and bias
+
+    def __init__(self, width: int = _WIDTH, edge_width: int = _EDGE_WIDTH, num_rounds: int = _ROUNDS) -> None:
+        super().__init__()
+        self.enter = nn.Linear(NUM_NODE + NUM_COST + 2, width)
+        self.enter_image = nn.Sequential(nn.Linear(NUM_VALUES, width), nn.ReLU(), nn.Linear(width, width, bias=False))
+        self.enter_out = nn.Linear(width, width)
+        self.rounds = nn.ModuleList(MessageRound(width, edge_width, plane=k > 1) for k in range(num_rounds))
+        self.head = nn.Linear(width, width)
+        self.last = nn.Linear(width, 1)
+        self.head_whole = nn.Linear(width, width, bias=False)
+        sizes = {
+            "nodes": NUM_NODE,
+            "cost": NUM_COST,
+            "image": NUM_VALUES,
+            "edges": NUM_EDGE,
+            "edge_image": NUM_EDGE_IMAGE,
+        }
+        for name, size in sizes.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_scale", torch.ones(size))
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
+
+    def forward(
+        self, matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Logit, as trained, and calibrated probability of each match being correct.
+
+        Args:
+            matches: B pairs; ``cost`` may be missing.
+            graphs: of the same matches.
+            evidence: of their images, or None.
+
+        Returns:
+            (M,) float32 each. Gradients flow to the keypoints from all that is continuous in them, and are finite.
+        """
+        logit, _ = self.infer(measure_quantities(matches, graphs, evidence))
+        return logit, self.calibrate(logit)
+
+    def infer(self, q: Quantities) -> tuple[Tensor, list[Tensor]]:
+        """(M,) logits, and those after the start and each round but the last, which training looks at too."""
+        with_image = bool(q.has_image.any())
+        cost = self._normalize("cost", q.cost) * q.has_cost
+        entered = self.enter(torch.cat([self._normalize("nodes", q.nodes), cost, q.has_cost, q.has_image], 1))
+        q = q._replace(edges=self._normalize("edges", q.edges))
+        if with_image:
+            entered = entered + self.enter_image(self._normalize("image", q.image)) * q.has_image
+            here = q.has_image.index_select(0, q.i)
+            image_i, image_j = (self._normalize("edge_image", x) * here for x in (q.image_i, q.image_j))
+            q = q._replace(image_i=image_i, image_j=image_j)
+        state = self.enter_out(entered.relu())
+        beliefs = []
+        for messages in self.rounds:
+            state, belief = messages(state, q, with_image)
+            beliefs.append(belief)
+        whole = self.head_whole(_pair_mean(state, q)).index_select(0, q.batch)
+        logit: Tensor = self.last((self.head(state) + whole).relu())[:, 0]
+        return logit, beliefs
+
+    def calibrate(self, logit: Tensor) -> Tensor:
+        """(M,) probability; logistic regression on the logit (Platt 1999), fitted on scenes left out of training."""
+        slope, bias = self.calibration
+        return torch.sigmoid(slope * logit + bias)
+
+    def _normalize(self, name: str, values: Tensor) -> Tensor:
+        mean, scale = getattr(self, f"{name}_mean"), getattr(self, f"{name}_scale")
+        return torch.addcmul(-mean * scale, values, scale).clamp(-_MAX_NORMALIZED, _MAX_NORMALIZED)
+
+
+class MessageRound(nn.Module):
+    """One round: along each pair of neighbours in both directions, then at every match.
+
+    Args:
+        width: of the state of a match.
+        edge_width: of a message.
+        plane: whether matches look at the plane through their believed neighbours.
+    """
+
+    def __init__(self, width: int, edge_width: int, *, plane: bool) -> None:
+        super().__init__()
+        self.ends = nn.Linear(width, 2 * edge_width)
+        self.edge = nn.Linear(NUM_EDGE, edge_width, bias=False)
+        self.edge_image = nn.Linear(NUM_EDGE_IMAGE, edge_width, bias=False)
+        self.belief = nn.Linear(width, 1)
+        self.plane = plane
+        self.mix = nn.Linear(width + edge_width + _NUM_PLANE * plane, width)
+        self.whole = nn.Linear(width, width, bias=False)
+        self.out = nn.Linear(width, width)
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, state: Tensor, q: Quantities, with_image: bool) -> tuple[Tensor, Tensor]:
+        """(M, width) state and (M,) logit of the belief before it."""
+        ends = self.ends(state)
+        between = self.edge(q.edges)
+        (hear_i, tell_i), (hear_j, tell_j) = (ends.index_select(0, rows).chunk(2, 1) for rows in (q.i, q.j))
+        to_i, to_j = (between + hear_i).add_(tell_j), (between + hear_j).add_(tell_i)
+        if with_image:
+            to_i, to_j = to_i.add_(self.edge_image(q.image_i)), to_j.add_(self.edge_image(q.image_j))
+        heard = q.receivers.sum(to_i.relu_(), to_j.relu_()) / q.degree
+        belief = self.belief(state)
+        known = [state, heard, _plane_residual(torch.sigmoid(belief), q)] if self.plane else [state, heard]
+        whole = self.whole(_pair_mean(state, q)).index_select(0, q.batch)
+        mixed = self.mix(torch.cat(known, 1)) + whole
+        return self.norm(state + self.out(mixed.relu())), belief[:, 0]
+
+
+def _pair_mean(state: Tensor, q: Quantities) -> Tensor:
+    """(B, K) means over the matches of each pair."""
+    return state.new_zeros(q.num_pairs, state.shape[1]).index_add(0, q.batch, state * q.share)
+
+
+def _plane_residual(weight: Tensor, q: Quantities) -> Tensor:
+    """(M, 9) how far each disparity is from the plane, and from the mean, through those of the weighted neighbours."""
+    x, y = q.step.clamp(-4, 4).unbind(1)
+    gap = q.disparity.index_select(0, q.j) - q.disparity.index_select(0, q.i)
+    gap = gap.clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
+    even = torch.stack([torch.ones_like(x), x * x, x * y, y * y, gap * x, gap * y])
+    odd = torch.stack([x, y, gap])  # turn their sign with the way
+    weight = weight[:, 0]
+    to_i = torch.cat([even, odd]) * weight.index_select(0, q.j)
+    to_j = torch.cat([even, -odd]) * weight.index_select(0, q.i)
+    total, xx, xy, yy, gx, gy, sx, sy, sg = q.receivers.sum(to_i.t(), to_j.t()).unbind(1)
+    safe = total + 0.01
+    mean_x, mean_y, mean_gap = sx / safe, sy / safe, sg / safe
+    xx, yy = xx - total * mean_x * mean_x + _RIDGE, yy - total * mean_y * mean_y + _RIDGE
+    xy = xy - total * mean_x * mean_y
+    gx, gy = gx - total * mean_gap * mean_x, gy - total * mean_gap * mean_y
+    determinant = (xx * yy - xy * xy).clamp(min=1e-3)
+    slope_x, slope_y = (gx * yy - gy * xy) / determinant, (gy * xx - gx * xy) / determinant
+    columns = []
+    for residual in ((mean_gap - slope_x * mean_x - slope_y * mean_y).abs(), mean_gap.abs()):
+        columns += [torch.exp(-residual / scale_px) for scale_px in (0.7, 2, 6)] + [torch.log1p(residual)]
+    return torch.stack([*columns, torch.log1p(total)], 1)
+
+
+@cache
+def load_learned(device: torch.device | None = None) -> LearnedScore:
+    """The network with the weights of this package, in evaluation mode and without gradients of its weights.
+
+    Args:
+        device: where it runs; None: the CPU.
+
+    Returns:
+        One network per device, shared by all callers.
+
+    >>> load_learned().training
+    False
+    """
+    from safetensors.torch import load_file
+
+    network = LearnedScore()
+    network.load_state_dict(load_file(WEIGHTS))
+    return network.requires_grad_(False).eval().to(device or torch.device("cpu"))
+
+
+def score_learned(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None) -> Tensor:
+    """Calibrated probability of every match being correct.
+
+    Args:
+        matches: B pairs of rectified views; ``cost`` may be missing.
+        graphs: of the same matches.
+        evidence: of their images, or None.
+
+    Returns:
+        (M,) float32 in (0, 1), higher is better. A match that is no vertex of the graphs (a duplicate) is scored from
+        its own quantities. Gradients flow to the keypoints from all that is continuous in them, and are finite.
+
+    Example:
+        >>> from tensor_stereo.graphs import build_match_graphs
+        >>> left = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)) * 300
+        >>> right = left - torch.tensor([20.0, 0.0])
+        >>> right[:30] = right[:30].flip(0)
+        >>> matches = Matches(left, right, torch.tensor([0, 300]))
+        >>> score = score_learned(matches, build_match_graphs(matches))
+        >>> bool(score[:30].max() < score[30:].median())
+        True
+    """
+    network = load_learned(matches.keypoints0.device)
+    parts = [network(*part)[1] for part in _parts(matches, graphs, evidence)]
+    return torch.cat(parts) if parts else matches.keypoints0.new_zeros(0, dtype=torch.float32)
+
+
+def _parts(
+    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None
+) -> Iterator[tuple[Matches, MatchGraphs, ImageEvidence | None]]:
+    """Runs of pairs whose matches number about :data:`_MATCHES_AT_ONCE`."""
+    offsets = matches.ptr.tolist()
+    first = 0
+    while first < matches.num_pairs:
+        last = first + 1
+        while last < matches.num_pairs and offsets[last + 1] - offsets[first] <= _MATCHES_AT_ONCE:
+            last += 1
+        rows = slice(offsets[first], offsets[last])
+        ptr = matches.ptr[first : last + 1] - rows.start
+        cost = None if matches.cost is None else matches.cost[rows]
+        part = Matches(matches.keypoints0[rows], matches.keypoints1[rows], ptr, cost=cost)
+        adjacency0, adjacency1 = (_cut(whole, rows, ptr) for whole in (graphs.adjacency0, graphs.adjacency1))
+        seen = None if evidence is None else ImageEvidence(*(values[rows] for values in evidence))
+        yield part, MatchGraphs(adjacency0, adjacency1, graphs.group_size[rows]), seen
+        first = last
+
+
+def _cut(adjacency: Adjacency, rows: slice, ptr: Tensor) -> Adjacency:
+    crow = adjacency.crow_indices[rows.start : rows.stop + 1]
+    start, stop = int(crow[0]), int(crow[-1])
+    return Adjacency(crow - start, adjacency.col_indices[start:stop] - rows.start, ptr)

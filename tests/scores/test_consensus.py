@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.autograd import forward_ad
+
+from tensor_stereo import Matches
+from tensor_stereo.configs import ConsensusConfig
+from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.scores.consensus import consensus_score
+from tests.oracles import installed_backends
+
+BACKENDS = installed_backends()
+
+
+def _matches(seed: int, num_matches: int, *, whole: bool = False) -> Matches:
+    rng = torch.Generator().manual_seed(seed)
+    left, other = (torch.rand(num_matches, 2, generator=rng, dtype=torch.float64) * 300 for _ in range(2))
+    shift = torch.stack([20 + 0.1 * left[:, 0] + 0.02 * left[:, 1], torch.zeros(num_matches)], 1)
+    right = torch.where(torch.rand(num_matches, 1, generator=rng) < 0.3, other, left - shift)
+    if whole:
+        left, right = left.round(), right.round()
+    cost = torch.rand(num_matches, generator=rng, dtype=torch.float64)
+    return Matches(left, right, torch.tensor([0, num_matches // 3, num_matches]), cost)
+
+
+def _score(matches: Matches, backend: str, **settings: float | None) -> torch.Tensor:
+    return consensus_score(matches, build_match_graphs(matches), ConsensusConfig(**settings), backend=backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@given(st.integers(0, 10**6), st.integers(1, 60), st.booleans())
+def test_order_shift_and_exchange_of_views_change_nothing(backend: str, seed: int, n: int, whole: bool) -> None:
+    matches = _matches(seed, n, whole=whole)
+    if whole:  # which duplicate is kept depends on the order, for equal costs
+        matches = dataclasses.replace(matches, cost=torch.arange(n, dtype=torch.float64) / n)
+    score = _score(matches, backend)
+    assert score.min() >= 0
+    assert score.max() <= 1
+    bounds = matches.ptr.tolist()
+    rng = torch.Generator().manual_seed(seed)
+    order = torch.cat([a + torch.randperm(b - a, generator=rng) for a, b in itertools.pairwise(bounds)])
+    shuffled = Matches(matches.keypoints0[order], matches.keypoints1[order], matches.ptr, matches.cost[order])
+    moved = dataclasses.replace(matches, keypoints0=matches.keypoints0 + 1024, keypoints1=matches.keypoints1 + 1024)
+    for other, expected in ((shuffled, score[order]), (moved, score), (matches.swap(), score)):
+        torch.testing.assert_close(_score(other, backend), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_quarter_turn_changes_nothing_without_rectification(backend: str) -> None:
+    matches = _matches(0, 90)
+    turn = torch.tensor([-1.0, 1.0])
+    turned = dataclasses.replace(
+        matches, keypoints0=matches.keypoints0.flip(1) * turn, keypoints1=matches.keypoints1.flip(1) * turn
+    )
+    found, expected = (_score(m, backend, row_tolerance_px=None) for m in (turned, matches))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_equal_displacements_are_believed_and_equal_costs_say_nothing(backend: str) -> None:
+    points = _matches(1, 90).keypoints0
+    none = Matches(points, points - torch.tensor([7.0, 0.0]), torch.tensor([0, 30, 90]))
+    equal = dataclasses.replace(none, cost=torch.full((90,), 5.0))
+    assert _score(none, backend).min() > 0.5
+    torch.testing.assert_close(_score(equal, backend), _score(none, backend), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_score_has_the_dtype_of_the_keypoints_and_finite_gradients(backend: str, dtype: torch.dtype) -> None:
+    for points, cost in (
+        (_matches(2, 50).keypoints0, torch.zeros(50)),
+        (_matches(2, 50, whole=True).keypoints0, torch.ones(50)),
+        (torch.zeros(50, 2), torch.rand(50)),
+        (torch.zeros(0, 2), torch.zeros(0)),
+    ):
+        left, right = (points.to(dtype).requires_grad_(), (points + 3).to(dtype).requires_grad_())
+        matches = Matches(left, right, torch.tensor([0, len(points)]), cost.to(dtype).requires_grad_())
+        score = _score(matches, backend)
+        assert score.dtype == dtype
+        for gradient in torch.autograd.grad(score.sum(), (left, right, matches.cost)):
+            assert gradient.dtype == dtype
+            assert gradient.isfinite().all()
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    matches = _matches(3, 30)
+    graphs = build_match_graphs(matches)
+    with pytest.raises(ValueError, match="adjacency0 must have 30 nodes, got 12"):
+        consensus_score(matches, build_match_graphs(_matches(3, 12)))
+    for name in ("tolerance_px", "row_tolerance_px", "slope", "reach", "doubt"):
+        with pytest.raises(ValueError, match=f"ConsensusConfig.{name} must be positive, got 0"):
+            consensus_score(matches, graphs, ConsensusConfig(**{name: 0}))
+    with pytest.raises(ValueError, match="cost_weight"):
+        consensus_score(matches, graphs, ConsensusConfig(cost_weight=-1))
+    with pytest.raises(ValueError, match="num_rounds"):
+        consensus_score(matches, graphs, ConsensusConfig(num_rounds=0))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # torch's own forward mode
+def test_a_tangent_is_refused_instead_of_dropped() -> None:
+    matches = _matches(4, 30)
+    graphs = build_match_graphs(matches)
+    for name in ("keypoints0", "keypoints1", "cost"):
+        values = getattr(matches, name)
+        with forward_ad.dual_level():
+            dual = forward_ad.make_dual(values, torch.ones_like(values))
+            with pytest.raises(NotImplementedError, match=f"{name} carries a tangent"):
+                consensus_score(dataclasses.replace(matches, **{name: dual}), graphs)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_costs_of_any_sign_are_evidence_and_infinite_ones_are_none(backend: str) -> None:
+    matches = _matches(3, 60)
+    assert matches.cost is not None
+    below = dataclasses.replace(matches, cost=matches.cost - 5)
+    least = dataclasses.replace(matches, cost=matches.cost - matches.cost.min())
+    assert _score(below, backend).isfinite().all()
+    first = slice(0, 20)  # the pairs have their own least cost
+    alone = [
+        Matches(m.keypoints0[first], m.keypoints1[first], torch.tensor([0, 20]), m.cost[first]) for m in (below, least)
+    ]
+    alone[1] = dataclasses.replace(alone[1], cost=alone[0].cost - alone[0].cost.min())
+    torch.testing.assert_close(_score(alone[0], backend), _score(alone[1], backend), rtol=0, atol=1e-12)
+    endless = matches.cost.clone()
+    endless[[3, 30]] = torch.inf
+    found = _score(dataclasses.replace(matches, cost=endless), backend, cost_weight=0.5)
+    order = dataclasses.replace(matches, cost=endless.isfinite().logical_not().double())  # the same duplicates
+    torch.testing.assert_close(found, _score(order, backend, cost_weight=0.0), rtol=0, atol=1e-12)

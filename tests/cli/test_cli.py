@@ -12,6 +12,7 @@ import pytest
 
 from tensor_stereo.cli import main
 from tensor_stereo.datasets.synthetic import render_pair
+from tests.cli.failing import fails
 
 
 @pytest.fixture(scope="module")
@@ -29,16 +30,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_pfm(folder / "disp0.pfm", disparity)
     cv2.imwrite(str(folder / "scaled.png"), np.round(disparity * 256).astype(np.uint16))
     return folder
-
-
-def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str], *words: str) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1, error
-    for word in words:
-        assert word in error
 
 
 def test_help_needs_no_torch() -> None:
@@ -103,7 +94,7 @@ def test_evaluate_writes_a_run_folder(scene: Path, tmp_path: Path, capsys: pytes
     figures = sorted(path.name for path in (out / "figures").iterdir())
     assert figures == ["rendered-fast.png", "rendered-gftt.png"]
     main([*command, "--out", str(out)])  # the same settings may run again
-    _fails([*command, "--out", str(out), "--min-group-size", "4"], capsys, "settings.json", "out")
+    fails([*command, "--out", str(out), "--min-group-size", "4"], capsys, "settings.json", "out")
 
 
 def test_preset_paper_sets_the_ratio(scene: Path, tmp_path: Path) -> None:
@@ -119,17 +110,17 @@ def test_bad_input_is_one_line_and_exit_code_2(scene: Path, tmp_path: Path, caps
     cv2.imwrite(str(small), np.zeros((20, 30), np.uint8))
     empty = tmp_path / "empty.png"
     empty.touch()
-    _fails(["classify", left, str(tmp_path / "none.png")], capsys, "none.png")
-    _fails(["classify", left, str(empty)], capsys, "empty.png")
-    _fails(["classify", left, str(small)], capsys, "small.png")
-    _fails(["classify", left, right, "--disparity-gt", str(small), "--gt-scale", "4"], capsys, "small.png")
-    _fails(["classify", left, right, "--disparity-gt", str(scene / "scaled.png")], capsys, "--gt-scale")
-    _fails(["classify", left, right, "--out", str(tmp_path / "matches.xlsx")], capsys, "out", ".csv")
-    _fails(["classify", left, right, "--out", str(tmp_path / "no" / "matches.csv")], capsys, "out")
-    _fails(["evaluate", str(tmp_path / "nothing")], capsys, "nothing")
-    _fails(["evaluate", str(tmp_path)], capsys, "looked for")
-    _fails(["evaluate", str(scene), "--scenes", "Atlantis"], capsys, "Atlantis", "rendered")
-    _fails(["classify", left, right, "--min-group-size", "0"], capsys, "min_group_size")
+    fails(["classify", left, str(tmp_path / "none.png")], capsys, "none.png")
+    fails(["classify", left, str(empty)], capsys, "empty.png")
+    fails(["classify", left, str(small)], capsys, "small.png")
+    fails(["classify", left, right, "--disparity-gt", str(small), "--gt-scale", "4"], capsys, "small.png")
+    fails(["classify", left, right, "--disparity-gt", str(scene / "scaled.png")], capsys, "--gt-scale")
+    fails(["classify", left, right, "--out", str(tmp_path / "matches.xlsx")], capsys, "out", ".csv")
+    fails(["classify", left, right, "--out", str(tmp_path / "no" / "matches.csv")], capsys, "out")
+    fails(["evaluate", str(tmp_path / "nothing")], capsys, "nothing")
+    fails(["evaluate", str(tmp_path)], capsys, "looked for")
+    fails(["evaluate", str(scene), "--scenes", "Atlantis"], capsys, "Atlantis", "rendered")
+    fails(["classify", left, right, "--min-group-size", "0"], capsys, "min_group_size")
 
 
 def test_constant_images_give_an_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

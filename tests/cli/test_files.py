@@ -8,16 +8,7 @@ import polars as pl
 import pytest
 
 from tensor_stereo.cli import main
-
-
-def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str], *words: str) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1, error
-    for word in words:
-        assert word in error
+from tests.cli.failing import fails
 
 
 def test_rendered_pairs_are_indexed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,8 +53,8 @@ def test_a_run_gets_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _fails(["download", "kitti-2051", "--out", str(tmp_path)], capsys, "kitti-2051", "kitti-2015")
-    _fails(["download", "--out", str(tmp_path)], capsys, "names")
-    _fails(["report", str(tmp_path)], capsys, "no run")
-    _fails(["filter", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b.txt")], capsys, "source", ".npz")
-    _fails(["filter", str(tmp_path / "a.csv"), "--out", str(tmp_path / "b.csv")], capsys, "a.csv")
+    fails(["download", "kitti-2051", "--out", str(tmp_path)], capsys, "kitti-2051", "kitti-2015")
+    fails(["download", "--out", str(tmp_path)], capsys, "names")
+    fails(["report", str(tmp_path)], capsys, "no run")
+    fails(["filter", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b.txt")], capsys, "source", ".npz")
+    fails(["filter", str(tmp_path / "a.csv"), "--out", str(tmp_path / "b.csv")], capsys, "a.csv")

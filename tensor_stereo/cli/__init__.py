@@ -32,7 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
-    from tensor_stereo.cli.runners import run  # torch is needed from here on
+    # torch is needed from here on; a sweep that only looks at what is done needs neither reports nor figures
+    if isinstance(command, Sweep):
+        from tensor_stereo.cli.sweep import run_sweep_command as run
+    else:
+        from tensor_stereo.cli.runners import run
     from tensor_stereo.sweeps.journal import SweepError
 
     try:

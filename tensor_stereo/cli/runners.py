@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report
 from tensor_stereo.cli.download import run_download_command
-from tensor_stereo.cli.sweep import run_sweep_command
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
 from tensor_stereo.datasets.synthetic import SyntheticDataset, write_synthetic
@@ -28,8 +27,6 @@ from tensor_stereo.reports.tables import Table, to_markdown
 
 def run(command: Any) -> int:
     """Carry out a parsed command; its exit code."""
-    if isinstance(command, Sweep):
-        return run_sweep_command(command)
     _RUNNERS[type(command)](command)
     return 0
 

@@ -8,10 +8,12 @@ from typing import Literal, get_args
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
 TemperatureUnit = Literal["edge", "px"]
-ScoreName = Literal["none", "topology", "consensus", "learned"]
+Score = Literal["topology", "consensus", "learned"]
+ScoreName = Literal["none", Score]
 Backend = Literal["auto", "native", "scipy"]
 
 RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
+SCORES: tuple[Score, ...] = get_args(Score)
 DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4
 
 

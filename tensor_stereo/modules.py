@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded
-from tensor_stereo.configs import Backend, ConsensusConfig, Restriction, TemperatureUnit
+from tensor_stereo.configs import SCORES, Backend, ConsensusConfig, Restriction, Score, TemperatureUnit
 from tensor_stereo.filters import FilterOutput, check_verdict, classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.ops.segments import check_options
@@ -26,7 +26,6 @@ from tensor_stereo.soft import (
 )
 from tensor_stereo.types import Matches, Relation, check_unit
 
-SCORES = ("topology", "consensus", "learned")
 UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
 
 
@@ -69,7 +68,7 @@ class DelaunayFilter(nn.Module):
         self,
         *,
         restriction: Restriction = "cardinality",
-        score: Literal["topology", "consensus", "learned"] = "consensus",
+        score: Score = "consensus",
         consensus: ConsensusConfig | None = None,
         temperature: float = 1.0,
         unit: TemperatureUnit = "edge",

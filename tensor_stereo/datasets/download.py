@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
 
+from tensor_stereo.atomic import whole_file
+
 from .archives import is_archive, unpack_archive
 from .files import StrPath
 from .image_size import image_size
@@ -215,10 +217,5 @@ def _read_lock(root: Path) -> dict[str, _Entry]:
 def _write_lock(root: Path, entries: Mapping[str, _Entry]) -> None:
     """Write the lock file in one step: there is the old one or the new one."""
     lock = {"version": _LOCK_VERSION, "entries": {url: asdict(entry) for url, entry in sorted(entries.items())}}
-    path = root / LOCK_NAME
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with whole_file(root / LOCK_NAME) as part:
         part.write_text(json.dumps(lock, indent=1) + "\n", encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.sweeps.grid import expand_grid
 from tensor_stereo.sweeps.journal import read_journals
-from tensor_stereo.sweeps.store import ERRORS_SCHEMA, MATCHES_SCHEMA, METRICS_SCHEMA
+from tensor_stereo.sweeps.store import MATCHES_SCHEMA, METRICS_SCHEMA, errors_table
 from tensor_stereo.types import Matches
 
 
@@ -64,8 +64,7 @@ def read_errors(run: Path | str) -> pl.DataFrame:
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
     """
-    errors = sorted(read_journals(_check_run(run)).errors.values(), key=lambda record: int(record["unit"]))
-    return pl.DataFrame(errors, ERRORS_SCHEMA)
+    return errors_table(_check_run(run))
 
 
 def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -> StoredMatches:

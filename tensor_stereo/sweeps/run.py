@@ -107,7 +107,7 @@ def run_sweep(
         config: the points of the grid.
         manifest: Parquet file as :func:`tensor_stereo.datasets.write_manifest` writes it.
         out: run folder; see :mod:`tensor_stereo.sweeps.store` for what it holds.
-        engine: ``local``, a pool of processes, or ``ray``.
+        engine: ``local``, processes on this machine, or ``ray``.
         num_workers: None: one per core of this machine or cluster.
         ray_address: of a running Ray cluster; None: the one that this process is connected to, or a new one.
         shard: (i, n): do the i-th of n parts of the sweep, counted from 1. Shards may run at the same time.

@@ -163,8 +163,13 @@ class RunStore:
 
     def _write_errors(self) -> None:
         """The failed units of all shards, as one table."""
-        errors = sorted(read_journals(self.out).errors.values(), key=lambda record: int(record["unit"]))
-        _write_table(pl.DataFrame(errors, ERRORS_SCHEMA), self.out / "errors.parquet")
+        _write_table(errors_table(self.out), self.out / "errors.parquet")
+
+
+def errors_table(out: Path) -> pl.DataFrame:
+    """The failed units of all shards, by number, with the columns of ``ERRORS_SCHEMA``."""
+    errors = sorted(read_journals(out).errors.values(), key=lambda record: int(record["unit"]))
+    return pl.DataFrame(errors, ERRORS_SCHEMA)
 
 
 def write_json(value: Any, path: Path) -> None:

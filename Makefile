@@ -70,7 +70,7 @@ SUITES := graphs relations classify soft matching pipeline scaling adversarial s
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)
 	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet -c $(CONSTRAINTS) torch kornia numpy scipy mahotas polars rich tyro \
-	  matplotlib pillow ray opencv-contrib-python-headless shull
+	  matplotlib pillow ray safetensors opencv-contrib-python-headless shull
 	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps --force-reinstall .
 	cd benchmarks && for suite in $(SUITES); do $(abspath $(BENCH_VENV))/bin/python bench_$$suite.py || exit 1; done
 

@@ -42,7 +42,7 @@ class Putatives:
         ratio: (M,) distance over that of the second-best candidate; NaN without one.
         valid: (M,) ground truth is known.
         correct: (M,) the disparity is off by at most :data:`MAX_ERROR_PX`.
-        size: (height, width) of the images.
+        views: grey images (H, W) of both views.
     """
 
     scene: str
@@ -52,7 +52,12 @@ class Putatives:
     ratio: Float
     valid: Bool
     correct: Bool
-    size: tuple[int, int]
+    views: tuple[Gray, Gray]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the images."""
+        return self.views[0].shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +117,7 @@ def find_putatives(pair: GrayPair, detector: str, *, gated: bool) -> Putatives:
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.where(np.isfinite(second) & (second > 0), np.sqrt(best / second), np.nan)
     valid, correct = _compare(points0, points1, pair.disparity_gt)
-    return Putatives(pair.scene, points0, points1, best, ratio, valid, correct, pair.left.shape)
+    return Putatives(pair.scene, points0, points1, best, ratio, valid, correct, (pair.left, pair.right))
 
 
 def inject_outliers(clean: Putatives, share: float, seed: int) -> Putatives:
@@ -142,6 +147,11 @@ def to_matches(found: list[Putatives], *, with_cost: bool = False) -> ts.Matches
     counts = [len(p.points0) for p in found]
     cost = torch.from_numpy(np.concatenate([p.cost for p in found])) if with_cost else None
     return ts.Matches(points0, points1, torch.tensor([0, *counts]).cumsum(0), cost)
+
+
+def to_images(found: list[Putatives]) -> list[list[torch.Tensor]]:
+    """(1, H, W) uint8 of all pairs, by view."""
+    return [[torch.from_numpy(one.views[view])[None] for one in found] for view in (0, 1)]
 
 
 def _select(given: Putatives, rows: Bool) -> Putatives:

@@ -3,36 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
-from accuracy_data import Putatives, to_matches
+from accuracy_data import Putatives, to_images, to_matches
 
 import tensor_stereo as ts
-from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.learned import score_learned
 
 
-def score_topology(matches: ts.Matches) -> torch.Tensor:
+class Given(NamedTuple):
+    """What a score sees of all pairs, as one batch."""
+
+    found: list[Putatives]
+    matches: ts.Matches
+    graphs: MatchGraphs
+
+
+class OurScore(NamedTuple):
+    """One of our scores, and whether it is given the cost where there is one."""
+
+    score: Callable[[Given], torch.Tensor]
+    has_cost: bool
+    needs_cost: bool = False
+
+
+def score_topology(given: Given) -> torch.Tensor:
     """The soft Jaccard index of the neighbours in both views."""
-    return ts.DelaunayFilter(score="topology")(matches).score
+    return ts.DelaunayFilter(score="topology")(given.matches).score
 
 
-def score_consensus(matches: ts.Matches) -> torch.Tensor:
+def score_consensus(given: Given) -> torch.Tensor:
     """Agreement with the planes of the believed neighbours; with the cost as evidence if the matches have one."""
-    return consensus_score(matches, build_match_graphs(matches))
+    return consensus_score(given.matches, given.graphs)
 
 
-def score_without_images(matches: ts.Matches) -> torch.Tensor:
+def score_without_images(given: Given) -> torch.Tensor:
     """The learned score, which sees points and cost only."""
-    return score_learned(matches, build_match_graphs(matches))
+    return score_learned(given.matches, given.graphs)
 
 
-OURS: dict[str, tuple[Callable[[ts.Matches], torch.Tensor], bool]] = {  # score, and whether it is given the cost
-    "topology": (score_topology, False),
-    "consensus": (score_consensus, False),
-    "consensus + cost": (score_consensus, True),
-    "learned, no images": (score_without_images, True),
+def score_with_images(given: Given) -> torch.Tensor:
+    """The learned score, with all evidence."""
+    evidence = measure_images(*to_images(given.found), given.matches, given.graphs)
+    return score_learned(given.matches, given.graphs, evidence)
+
+
+OURS = {
+    "topology": OurScore(score_topology, has_cost=False),
+    "consensus": OurScore(score_consensus, has_cost=False),
+    "consensus + cost": OurScore(score_consensus, has_cost=True, needs_cost=True),
+    "learned, no images": OurScore(score_without_images, has_cost=True),
+    "learned": OurScore(score_with_images, has_cost=True),
 }
 
 
@@ -40,10 +65,11 @@ OURS: dict[str, tuple[Callable[[ts.Matches], torch.Tensor], bool]] = {  # score,
 def score_ours(found: list[Putatives], *, has_cost: bool = True) -> list[dict[str, torch.Tensor]]:
     """Each score of each pair; all pairs are scored in one batch."""
     scores: list[dict[str, torch.Tensor]] = [{} for _ in found]
-    for name, (score, uses_cost) in OURS.items():
-        if uses_cost and not has_cost:
+    for name, ours in OURS.items():
+        if ours.needs_cost and not has_cost:
             continue
-        matches = to_matches(found, with_cost=uses_cost)
-        for own, part in zip(scores, score(matches).split(matches.ptr.diff().tolist()), strict=True):
+        matches = to_matches(found, with_cost=ours.has_cost and has_cost)
+        score = ours.score(Given(found, matches, build_match_graphs(matches)))
+        for own, part in zip(scores, score.split(matches.ptr.diff().tolist()), strict=True):
             own[name] = part
     return scores

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import torch
+from accuracy_calibration import report_calibration
 from accuracy_data import DETECTORS, Putatives, add_noise, find_putatives, inject_outliers, load_pairs
 from accuracy_figures import draw_degradation, draw_roc
 from accuracy_peers import score_peers
@@ -108,6 +109,7 @@ def main() -> None:
                 title = f"{detector}{', gated' if gated else ''}"
                 figures, curves = measure(found)
                 report(suite, {"group": group, "putatives": title}, figures, curves)
+                report_calibration(suite, {"group": group, "putatives": title}, found)
                 panels[title] = {name: curve.mean(0) for name, curve in curves.items()}
         draw_roc(group, GRID, panels)
     source = "eight" if pairs["eight"] else "synthetic"

@@ -1,4 +1,10 @@
-"""What a filter buys: dense maps, depth and epipolar geometry from the matches that it keeps."""
+"""What a filter buys: dense maps, depth and epipolar geometry from the matches that it keeps.
+
+    python bench_dense.py --folds WORK
+
+Thresholds are chosen on the training scenes; there the learned score is that of the network which never saw the scene,
+from the folder WORK of ``train_learned.py``.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +18,8 @@ from accuracy_data import DETECTORS, GrayPair, Putatives, find_putatives, load_p
 from accuracy_peers import score_disparity, score_lpm
 from dense_figures import draw_bars, draw_maps
 from harness import Suite
+from safetensors.torch import load_file
+from train_learned import FOLDS, fold_weights
 
 import tensor_stereo as ts
 from tensor_stereo.datasets import find_pairs, read_calibration
@@ -19,11 +27,11 @@ from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.interpolation import interpolate_disparity
 from tensor_stereo.scores.consensus import consensus_score
 from tensor_stereo.scores.evidence import measure_images
-from tensor_stereo.scores.learned import score_learned
+from tensor_stereo.scores.learned import LearnedScore, load_learned
 
 BAD_PX = 2.0
 MAX_STEP_PX = 4.0  # where triangles are cut; of 2, 4, 8 and 16 the best on the training scenes
-NUM_THRESHOLDS = 13  # quantiles of each score over the training scenes
+NUM_THRESHOLDS = 13  # quantiles of each score, of correct and of other matches of the training scenes
 GRID_PX = 8  # of ground-truth correspondences for the epipolar distance
 RANSAC_ERROR_PX, CONFIDENCE = 1.0, 0.999
 FITS = {"8-point": cv2.FM_8POINT, "LMedS": cv2.FM_LMEDS, "RANSAC": cv2.FM_RANSAC}
@@ -38,7 +46,17 @@ Scored = dict[str, np.ndarray]
 Case = tuple[GrayPair, Putatives, Scored]
 
 
-def score_filters(pair: GrayPair, one: Putatives) -> Scored:
+def load_folds(work: Path) -> dict[str, LearnedScore]:
+    """Training scene -> the network that was trained without it."""
+    networks = {}
+    for scenes, path in zip(FOLDS, fold_weights(work), strict=True):
+        network = LearnedScore()
+        network.load_state_dict(load_file(path))
+        networks |= dict.fromkeys(scenes, network.eval())
+    return networks
+
+
+def score_filters(pair: GrayPair, one: Putatives, network: LearnedScore) -> Scored:
     """Every score of one pair, and the verdicts without a threshold as scores of 0 and 1."""
     plain, given = to_matches([one]), to_matches([one], with_cost=True)
     graphs = build_match_graphs(given)
@@ -47,7 +65,7 @@ def score_filters(pair: GrayPair, one: Putatives) -> Scored:
     ours = {
         "topology": ts.DelaunayFilter(score="topology")(plain).score,
         "consensus": consensus_score(given, graphs),
-        "learned": score_learned(given, graphs, measure_images(*views, given, graphs)),
+        "learned": network(given, graphs, measure_images(*views, given, graphs))[1],
         "paper R1+R2": ts.classify_matches(plain, min_group_size=1).inlier,
         "none": torch.ones(plain.num_matches),
         "oracle": torch.from_numpy(one.correct & one.valid),
@@ -106,7 +124,9 @@ def choose_thresholds(cases: list[Case]) -> dict[str, tuple[np.ndarray, np.ndarr
     chosen = {}
     for name in SCORES:
         pooled = np.concatenate([scores[name] for *_, scores in cases])
-        thresholds = np.unique(np.quantile(pooled, np.linspace(0, 0.96, NUM_THRESHOLDS)))
+        right = np.concatenate([one.correct & one.valid for _, one, _ in cases])
+        shares = np.linspace(0, 0.96, NUM_THRESHOLDS)
+        thresholds = np.unique([np.quantile(part, shares) for part in (pooled[right], pooled[~right])])
         bad = [[measure_maps(pair, one, s[name] >= t)["bad2"] for t in thresholds] for pair, one, s in cases]
         chosen[name] = thresholds, np.array(bad)
     return chosen
@@ -149,12 +169,25 @@ def find_offsets(root: Path) -> dict[str, float]:
 
 
 def run(
-    suite: Suite, pairs: dict[str, list[GrayPair]], offsets: dict[str, float], detector: str, gated: bool
+    suite: Suite,
+    pairs: dict[str, list[GrayPair]],
+    offsets: dict[str, float],
+    folds: dict[str, LearnedScore],
+    detector: str,
+    gated: bool,
 ) -> dict[str, dict[str, np.ndarray]]:
     """Everything about one kind of putative matches; the table of the eight scenes."""
     title = f"{detector}{', gated' if gated else ''}"
     found = {g: [find_putatives(pair, detector, gated=gated) for pair in pairs[g]] for g in pairs}
-    cases = {g: [(*case, score_filters(*case)) for case in zip(pairs[g], found[g], strict=True)] for g in pairs}
+    networks = {"training": [folds[pair.scene] for pair in pairs["training"]]}
+    networks["eight"] = [load_learned()] * len(pairs["eight"])
+    cases = {
+        g: [
+            (pair, one, score_filters(pair, one, net))
+            for pair, one, net in zip(pairs[g], found[g], networks[g], strict=True)
+        ]
+        for g in pairs
+    }
     chosen = choose_thresholds(cases["training"])
     best = {name: float(t[bad.mean(0).argmin()]) for name, (t, bad) in chosen.items()}
     table = {}
@@ -191,16 +224,16 @@ def show_maps(case: Case, best: dict[str, float]) -> None:
 
 @torch.no_grad()
 def main() -> None:
-    suite = Suite("dense")
+    suite = Suite("dense", folds="the folder WORK of train_learned.py")
     cv2.setNumThreads(1)
     groups = load_pairs(suite.options.data)
     pairs = {group: groups[group] for group in ("training", "eight")}
-    offsets = find_offsets(suite.options.data)
+    offsets, folds = find_offsets(suite.options.data), load_folds(suite.options.folds)
     tables = {}
     for detector in DETECTORS:
         for gated in (False, True):
             title = f"{detector}{', gated' if gated else ''}"
-            tables[title] = run(suite, pairs, offsets, detector, gated)
+            tables[title] = run(suite, pairs, offsets, folds, detector, gated)
     draw_bars(tables)
     suite.write()
 

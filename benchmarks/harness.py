@@ -20,12 +20,19 @@ PACKAGES = ("tensor-stereo", "torch", "numpy", "scipy", "kornia", "opencv-contri
 
 
 class Suite:
-    """One suite of comparisons; prints each and writes all as JSON."""
+    """One suite of comparisons; prints each and writes all as JSON.
 
-    def __init__(self, name: str) -> None:
+    Args:
+        name: of the suite.
+        folders: further options that it needs, and what they hold.
+    """
+
+    def __init__(self, name: str, **folders: str) -> None:
         parser = argparse.ArgumentParser(description=f"benchmark suite {name}")
         parser.add_argument("--repeats", type=int, default=15)
         parser.add_argument("--data", type=Path, default=os.environ.get("TENSOR_STEREO_DATA"))
+        for folder, text in folders.items():
+            parser.add_argument(f"--{folder}", type=Path, required=True, help=text)
         self.options = parser.parse_args()
         self.name = name
         self.records: list[dict] = []

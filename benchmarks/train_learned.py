@@ -2,8 +2,9 @@
 
     python train_learned.py DATA/middlebury WORK weights.safetensors
 
-WORK receives the records of every scene (about 200 MB) and the figures of the cross-validation. Everything follows from
-the seeds below; each training runs on one thread. The eight scenes of the paper (2003, 2005) are never read.
+WORK receives the records of every scene (about 200 MB), and the weights and the figures of the cross-validation.
+Everything follows from the seeds below; each training runs on one thread. The eight scenes of the paper (2003, 2005)
+are never read.
 """
 
 from __future__ import annotations
@@ -55,6 +56,11 @@ def make_scene(work: Path, data: Path, job: tuple[str, int]) -> None:
     real = not scene.startswith("synthetic")
     views = read_scenes(data)[scene] if real else render_views(number)
     torch.save(make_records(scene, number, views, real=real), work / f"{scene}.pt")
+
+
+def fold_weights(work: Path) -> list[Path]:
+    """Where the weights are that were trained without the scenes of each fold."""
+    return [work / f"fold-{k}.safetensors" for k in range(len(FOLDS))]
 
 
 def load_records(work: Path, scenes: list[str]) -> list[Record]:
@@ -214,13 +220,16 @@ def main() -> None:
         print(f"{len(missing)} scenes: {time.perf_counter() - start:.0f} s", flush=True)
         whole, *folds = pool.map(partial(cross_validate, options.work), [None, *range(len(FOLDS))], chunksize=1)
     logit, correct, weight = (torch.cat([fold["left out"][k] for fold in folds]) for k in range(3))
-    whole["weights"]["calibration"] = fit_calibration(logit, correct.bool(), weight)
-    save_file({name: values.contiguous() for name, values in whole["weights"].items()}, options.out)
+    calibration = fit_calibration(logit, correct.bool(), weight)
+    for result in (whole, *folds):
+        result["weights"]["calibration"] = calibration
+    for path, result in zip([options.out, *fold_weights(options.work)], [whole, *folds], strict=True):
+        save_file({name: values.contiguous() for name, values in result["weights"].items()}, path)
     table = {
         key: np.mean([x for fold in folds for x in fold["figures"].get(key, [])], 0).round(3).tolist()
         for key in folds[0]["figures"]
     }
-    report = {"cross-validation": table, "calibration": whole["weights"]["calibration"].tolist()}
+    report = {"cross-validation": table, "calibration": calibration.tolist()}
     (options.work / "figures.json").write_text(json.dumps(report, indent=1))
     print(json.dumps(report, indent=1), f"{time.perf_counter() - start:.0f} s", sep="\n")
 

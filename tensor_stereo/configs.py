@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
 TemperatureUnit = Literal["edge", "px"]
 Score = Literal["topology", "consensus", "learned"]
-ScoreName = Literal["none", Score]
+ScoreName = Literal["none", Score]  # none: no score, and no curve in the results
 Backend = Literal["auto", "native", "scipy"]
 
 RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
 SCORES: tuple[Score, ...] = get_args(Score)
+CUTS = ("threshold", "target_sensitivity", "min_precision")  # ways to a verdict by score, of which one may be given
 DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4
 
 
@@ -80,12 +82,52 @@ class ObjectsConfig:
 
 @dataclass(frozen=True)
 class ClassifyConfig:
-    """The set test on the two Delaunay graphs (the paper, section 3)."""
+    """The set test on the two Delaunay graphs (the paper, section 3), and the score of every match beside it.
+
+    ``threshold``, ``target_sensitivity`` or ``min_precision`` make the verdict one of the score instead of the
+    restriction. The last two choose the threshold of each pair from calibrated scores, by what these let expect.
+    """
 
     restriction: Restriction = "cardinality"
     min_group_size: int = 4  # distinct matches below which a group says nothing
     tie_tolerance: float = 1e-3  # in edge lengths
     backend: Backend = "auto"
+    score: ScoreName = "consensus"
+    temperature: float = 1.0  # of the score topology
+    temperature_unit: TemperatureUnit = "edge"
+    threshold: float | None = None  # least score of a match that is kept
+    target_sensitivity: float | None = None  # fraction of the incorrect matches that are rejected, at least
+    min_precision: float | None = None  # fraction of the kept matches that are correct, at least
+
+    def __post_init__(self) -> None:
+        given = [name for name in CUTS if getattr(self, name) is not None]
+        for name in given:
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} must lie in [0, 1] or be None, got {value}")
+            if self.score == "none":
+                raise ValueError(f"{name} must be None where score is 'none', got {value}")
+            if self.score == "topology" and name != "threshold":
+                raise ValueError(f"{name} needs a calibrated score, which 'topology' is not; got {value}")
+        if len(given) > 1:
+            raise ValueError(f"{given[1]} must be None beside {given[0]}, got {getattr(self, given[1])}")
+
+    @property
+    def by_score(self) -> bool:
+        """Whether the score decides, not the restriction."""
+        return any(getattr(self, name) is not None for name in CUTS)
+
+
+def describe_verdict(settings: Mapping[str, Any]) -> str:
+    """What decides under some settings, in a few words.
+
+    >>> describe_verdict({"restriction": "adjacency"}), describe_verdict({"score": "learned", "min_precision": 0.9})
+    ('adjacency', 'learned, min precision 0.9')
+    """
+    for name in CUTS:
+        if settings.get(name) is not None:
+            return f"{settings['score']}, {name.replace('_', ' ')} {settings[name]:g}"
+    return str(settings["restriction"])
 
 
 @dataclass(frozen=True)
@@ -132,26 +174,21 @@ class PipelineConfig(StepConfigs):
 
 @dataclass(frozen=True)
 class TrialConfig(PipelineConfig):
-    """One point of a sweep's grid: a pipeline, what is done to its putative matches, and how they are scored."""
+    """One point of a sweep's grid: a pipeline, and what is done to its putative matches."""
 
     outlier_rate: float = 0.0  # fraction of the matches whose partners in view 1 change places among them
     noise_px: float = 0.0  # standard deviation added to x and y of both keypoints
     seed: int = 0  # of outliers and noise, together with the name of the pair
-    score: ScoreName = "consensus"  # none: no score, and no curve in the results
-    temperature: float = 1.0  # of the score topology
-    temperature_unit: TemperatureUnit = "edge"
-    threshold: float | None = None  # verdict by score >= threshold instead of by restriction
     max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.outlier_rate <= 1:
             raise ValueError(f"outlier_rate must lie in [0, 1], got {self.outlier_rate}")
         if not 0 <= self.noise_px < float("inf"):
             raise ValueError(f"noise_px must be finite and not negative, got {self.noise_px}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        if self.score == "none" and self.threshold is not None:
-            raise ValueError(f"threshold must be None where score is 'none', got {self.threshold}")
 
 
 @dataclass(frozen=True)
@@ -181,7 +218,6 @@ class EvaluationConfig(StepConfigs):
             TrialConfig(
                 **shared | {"restriction": restriction},
                 constrained=constrained,
-                score="none",
                 max_error_px=self.max_error_px,
             )
             for constrained in (False, True)

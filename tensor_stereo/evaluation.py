@@ -37,7 +37,9 @@ ROW_SCHEMA: dict[str, Any] = {
     "score": pl.String,
     "temperature": pl.Float64,  # of the score topology, else null
     "temperature_unit": pl.String,
-    "threshold": pl.Float64,  # null: the verdict is that of the restriction
+    "threshold": pl.Float64,  # null, as the next two: the verdict is that of the restriction
+    "target_sensitivity": pl.Float64,
+    "min_precision": pl.Float64,
     "num_matches": pl.Int64,
     "num_valid": pl.Int64,  # ground truth is known
     "num_untested": pl.Int64,  # among all matches

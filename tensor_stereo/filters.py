@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from tensor_stereo import ops
 from tensor_stereo.batching import select_matches
-from tensor_stereo.configs import RESTRICTIONS, Backend, Restriction
+from tensor_stereo.configs import RESTRICTIONS, Backend, ClassifyConfig, Restriction
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.relations import shared_neighbors
-from tensor_stereo.types import Classification, Matches
+from tensor_stereo.scores.calibration import calibrate_consensus, keep_by_target
+from tensor_stereo.types import Classification, Matches, Relation
+
+UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
 
 
 def classify_matches(
@@ -86,6 +90,40 @@ def check_verdict(restriction: str, min_group_size: int) -> None:
         raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
     if restriction not in RESTRICTIONS:
         raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
+
+
+def apply_score(
+    verdict: Classification, score: Tensor, ptr: Tensor, config: ClassifyConfig, *, rectified: bool = True
+) -> tuple[Classification, Tensor]:
+    """Bring the set tests and the score of the same matches together.
+
+    Args:
+        verdict: of M matches.
+        score: (M,), the one that ``config`` names.
+        ptr: (B + 1,) int64 offsets.
+        config: says whether, and at which threshold, the score decides.
+        rectified: whether the score looks at row offsets, for its calibration.
+
+    Returns:
+        The verdict, by the score if ``config`` wants that; and the score, 0 where the match is UNTESTED. No gradient
+        flows from the verdict.
+
+    >>> left = torch.rand(30, 2, generator=torch.Generator().manual_seed(0)) * 100
+    >>> verdict = classify_matches(Matches(left, left, torch.tensor([0, 30])))
+    >>> score = torch.linspace(0, 1, 30)
+    >>> apply_score(verdict, score, torch.tensor([0, 30]), ClassifyConfig(threshold=0.5))[0].inlier.sum()
+    tensor(15)
+    """
+    tested = verdict.relation != UNTESTED
+    score = torch.where(tested, score, torch.zeros_like(score))
+    if not config.by_score:
+        return verdict, score
+    fixed = score.detach()
+    if config.threshold is not None:
+        return replace(verdict, inlier=tested & (fixed >= config.threshold)), score
+    probability = calibrate_consensus(fixed, rectified=rectified) if config.score == "consensus" else fixed
+    targets = {"target_sensitivity": config.target_sensitivity, "min_precision": config.min_precision}
+    return replace(verdict, inlier=keep_by_target(probability, tested, ptr, **targets)), score
 
 
 @dataclass(frozen=True, eq=False)

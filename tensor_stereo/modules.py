@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded
-from tensor_stereo.configs import SCORES, Backend, ConsensusConfig, Restriction, Score, TemperatureUnit
-from tensor_stereo.filters import FilterOutput, check_verdict, classify_graphs
-from tensor_stereo.graphs import MatchGraphs, build_match_graphs
+from tensor_stereo.configs import SCORES, Backend, ClassifyConfig, ConsensusConfig, Restriction, Score, TemperatureUnit
+from tensor_stereo.filters import FilterOutput, apply_score, check_verdict, classify_graphs
 from tensor_stereo.ops.segments import check_options
-from tensor_stereo.scores.consensus import check_consensus, consensus_score
+from tensor_stereo.scores.consensus import check_consensus
 from tensor_stereo.scores.evidence import ImageEvidence
-from tensor_stereo.scores.learned import score_learned
-from tensor_stereo.soft import (
-    COLDEST,
-    HOTTEST,
-    build_soft_graphs,
-    check_temperature,
-    count_soft_neighbors,
-    soft_jaccard,
-)
-from tensor_stereo.types import Matches, Relation, check_unit
-
-UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
+from tensor_stereo.scores.scoring import score_matches
+from tensor_stereo.soft import COLDEST, HOTTEST, check_temperature
+from tensor_stereo.types import Matches, check_unit
 
 
 class DelaunayFilter(nn.Module):
@@ -40,10 +29,15 @@ class DelaunayFilter(nn.Module):
             ``topology``, how far both neighbour sets agree: their soft Jaccard index, 1 iff Restriction 1 holds.
         consensus: settings of that score; None means the defaults, for rectified pairs.
         temperature: of ``topology``: below which dual Voronoi edges are hardly told from ties.
-        unit: ``edge``: in lengths of the edge at hand, so that the score does not depend on scale; ``px``: in pixels.
+        temperature_unit: ``edge``: in lengths of the edge at hand, so that the score does not depend on scale; ``px``:
+            in pixels.
         learnable_temperature: whether the temperature is a parameter (its logarithm is what is learnt); for
             ``topology``.
         threshold: verdict by score >= threshold instead of by ``restriction``.
+        target_sensitivity: verdict by the score: as many matches of a pair are kept as let expect that this fraction of
+            the incorrect ones is rejected. For ``consensus`` and ``learned``, which are calibrated.
+        min_precision: verdict by the score: as many are kept as let expect that this fraction of the kept ones is
+            correct (the paper's negative predictive value). For ``consensus`` and ``learned``.
         straight_through: the score is the verdict, with the gradient of the soft score.
         min_group_size: as in :func:`tensor_stereo.classify_matches`.
         tie_tolerance: as in :func:`tensor_stereo.classify_matches`.
@@ -71,9 +65,11 @@ class DelaunayFilter(nn.Module):
         score: Score = "consensus",
         consensus: ConsensusConfig | None = None,
         temperature: float = 1.0,
-        unit: TemperatureUnit = "edge",
+        temperature_unit: TemperatureUnit = "edge",
         learnable_temperature: bool = False,
         threshold: float | None = None,
+        target_sensitivity: float | None = None,
+        min_precision: float | None = None,
         straight_through: bool = False,
         min_group_size: int = 4,
         tie_tolerance: float = 1e-3,
@@ -85,21 +81,25 @@ class DelaunayFilter(nn.Module):
             raise ValueError(f"score must be one of {', '.join(SCORES)}, got {score!r}")
         if learnable_temperature and score != "topology":
             raise ValueError(f"learnable_temperature must be False where score is {score!r}, which has no temperature")
-        self.consensus = ConsensusConfig() if consensus is None else consensus
-        check_consensus(self.consensus)
-        check_unit(unit)
+        check_unit(temperature_unit, "temperature_unit")
         check_temperature(temperature)
         check_options(tie_tolerance, backend)
-        if threshold is not None and not 0 <= threshold <= 1:
-            raise ValueError(f"threshold must lie in [0, 1] or be None, got {threshold}")
-        self.restriction = restriction
-        self.score = score
-        self.unit = unit
-        self.threshold = threshold
+        self.score: Score = score
+        self.consensus = ConsensusConfig() if consensus is None else consensus
+        check_consensus(self.consensus)
         self.straight_through = straight_through
-        self.min_group_size = min_group_size
-        self.tie_tolerance = tie_tolerance
-        self.backend = backend
+        self.config = ClassifyConfig(
+            restriction=restriction,
+            min_group_size=min_group_size,
+            tie_tolerance=tie_tolerance,
+            backend=backend,
+            score=score,
+            temperature=temperature,
+            temperature_unit=temperature_unit,
+            threshold=threshold,
+            target_sensitivity=target_sensitivity,
+            min_precision=min_precision,
+        )
         logarithm = torch.tensor(temperature, dtype=torch.float64).log()
         if learnable_temperature:
             self.log_temperature = nn.Parameter(logarithm)
@@ -108,7 +108,7 @@ class DelaunayFilter(nn.Module):
 
     @property
     def temperature(self) -> Tensor:
-        """() float64, in ``unit``, whatever the dtype that the module is moved to."""
+        """() float64, in ``temperature_unit``, whatever the dtype that the module is moved to."""
         return self.log_temperature.exp().clamp(COLDEST, HOTTEST)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DelaunayFilter:
@@ -163,32 +163,28 @@ class DelaunayFilter(nn.Module):
 
     def _classify(self, matches: Matches, evidence: ImageEvidence | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """inlier, score and relation of every match."""
-        if evidence is not None and self.score != "learned":
-            raise TypeError(f"evidence must be None where score is {self.score!r}, which looks at no image")
-        score, graphs = self._score(matches, evidence)
-        verdict = classify_graphs(
-            graphs, restriction=self.restriction, min_group_size=self.min_group_size, backend=self.backend
+        config = self.config
+        score, graphs = score_matches(
+            matches,
+            score=self.score,
+            consensus=self.consensus,
+            temperature=self.temperature,
+            temperature_unit=config.temperature_unit,
+            evidence=evidence,
+            tie_tolerance=config.tie_tolerance,
+            backend=config.backend,
         )
-        is_tested = verdict.relation != UNTESTED
-        score = torch.where(is_tested, score, torch.zeros_like(score))
+        verdict = classify_graphs(
+            graphs, restriction=config.restriction, min_group_size=config.min_group_size, backend=config.backend
+        )
         device = matches.keypoints0.device.type
         low = torch.is_autocast_enabled(device)
         score = score.to(torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype)
-        inlier = verdict.inlier if self.threshold is None else is_tested & (score.detach() >= self.threshold)
+        rectified = self.consensus.row_tolerance_px is not None
+        verdict, score = apply_score(verdict, score, matches.ptr, config, rectified=rectified)
         if self.straight_through:
-            score = score + (inlier.to(score.dtype) - score).detach()
-        return inlier, score, verdict.relation
-
-    def _score(self, matches: Matches, evidence: ImageEvidence | None) -> tuple[Tensor, MatchGraphs]:
-        """(M,) score of every vertex, and the hard graphs."""
-        if self.score == "topology":
-            options: dict[str, Any] = {"unit": self.unit, "tie_tolerance": self.tie_tolerance, "backend": self.backend}
-            found = build_soft_graphs(matches, self.temperature, **options)
-            return soft_jaccard(count_soft_neighbors(matches, found, self.temperature, **options)), found.graphs
-        graphs = build_match_graphs(matches, tie_tolerance=self.tie_tolerance, backend=self.backend)
-        if self.score == "consensus":
-            return consensus_score(matches, graphs, self.consensus, backend=self.backend), graphs
-        return score_learned(matches, graphs, evidence), graphs
+            score = score + (verdict.inlier.to(score.dtype) - score).detach()
+        return verdict.inlier, score, verdict.relation
 
 
 def _check_padded(

@@ -1,4 +1,4 @@
-"""Images -> features -> matches -> objects -> graphs -> verdicts, for a list of pairs of any sizes."""
+"""Images -> features -> matches -> objects -> graphs -> verdicts and scores, for a list of pairs of any sizes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from torch import Tensor
 from tensor_stereo.batching import concatenate_features, split_features
 from tensor_stereo.configs import MatchingConfig, PipelineConfig
 from tensor_stereo.features import detect_features, to_gray
-from tensor_stereo.filters import classify_graphs
+from tensor_stereo.filters import apply_score, classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
+from tensor_stereo.scores.evidence import measure_images
+from tensor_stereo.scores.scoring import score_matches
 from tensor_stereo.types import Classification, Features, Matches
 
 ImagePair = tuple[Tensor, Tensor]
-STAGES = ("detect", "match", "group", "graph", "relate")
+STAGES = ("detect", "match", "group", "graph", "relate", "score")
 
 
 @dataclass
@@ -46,17 +48,19 @@ class PipelineOutput:
         matches: the putative matches of all pairs, with ``group`` if the run was constrained.
         graphs: their Delaunay graphs.
         classification: one verdict per match.
+        score: (M,), higher is better, 0 for untested matches; None if the settings ask for none.
         seconds: wall time of each stage for the whole batch.
     """
 
     matches: Matches
     graphs: MatchGraphs
     classification: Classification
+    score: Tensor | None
     seconds: dict[str, float]
 
 
 def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineConfig()) -> PipelineOutput:
-    """Detect, match and classify a list of rectified pairs.
+    """Detect, match, classify and score a list of rectified pairs.
 
     Args:
         pairs: B pairs (image0, image1), each (C, H, W) uint8 or floating point in [0, 1], C = 1 or 3 (RGB). Sizes may
@@ -64,7 +68,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         config: settings of every step.
 
     Returns:
-        The matches of all pairs with their verdicts. No gradient.
+        The matches of all pairs with their verdicts and scores. No gradient.
 
     Raises:
         ValueError: if there is no pair, the views of one differ in size, or an image has another layout.
@@ -85,7 +89,11 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
     with watch.measure("relate"):
         verdicts = classify_graphs(graphs, restriction=config.restriction, min_group_size=config.min_group_size)
-    return PipelineOutput(matches, graphs, verdicts, watch.seconds)
+    with watch.measure("score"):
+        score = score_pairs(gray, matches, graphs, config)
+        if score is not None:
+            verdicts, score = apply_score(verdicts, score, matches.ptr, config)
+    return PipelineOutput(matches, graphs, verdicts, score, watch.seconds)
 
 
 def to_gray_pairs(pairs: Sequence[ImagePair]) -> list[ImagePair]:
@@ -142,3 +150,31 @@ def group_pairs(gray: Sequence[ImagePair], matches: Matches, config: PipelineCon
     with watch.measure("group"):
         labels0, labels1 = ([label_objects(pair[view], config.objects)[0] for pair in gray] for view in (0, 1))
         return replace(matches, group=group_matches(matches, labels0, labels1))
+
+
+@torch.no_grad()
+def score_pairs(
+    gray: Sequence[ImagePair], matches: Matches, graphs: MatchGraphs, config: PipelineConfig
+) -> Tensor | None:
+    """The score that the settings name of every match, in the dtype of the keypoints, also of untested ones.
+
+    Args:
+        gray: as :func:`to_gray_pairs` gives them; the score ``learned`` looks at them.
+        matches: of these pairs, rectified.
+        graphs: of these matches.
+        config: names the score; ``none`` gives None.
+    """
+    if config.score == "none":
+        return None
+    images0, images1 = ([pair[view][0] for pair in gray] for view in (0, 1))
+    score, _ = score_matches(
+        matches,
+        graphs,
+        score=config.score,
+        temperature=config.temperature,
+        temperature_unit=config.temperature_unit,
+        evidence=measure_images(images0, images1, matches, graphs) if config.score == "learned" else None,
+        tie_tolerance=config.tie_tolerance,
+        backend=config.backend,
+    )
+    return score.to(matches.keypoints0.dtype)

@@ -10,16 +10,14 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from tensor_stereo.configs import TrialConfig
-from tensor_stereo.filters import FilterOutput, classify_graphs
+from tensor_stereo.configs import CUTS, TrialConfig
+from tensor_stereo.filters import apply_score, classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.metrics import confusion_update, matches_against_gt, roc_update
-from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.perturbation import add_noise, inject_outliers
-from tensor_stereo.pipeline import Stopwatch, detect_pairs, matching_settings, to_gray_pairs
-from tensor_stereo.scores.evidence import measure_images
+from tensor_stereo.pipeline import Stopwatch, detect_pairs, matching_settings, score_pairs, to_gray_pairs
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
 STAGES = ("detect", "match", "perturb", "group", "graph", "relate", "score")
@@ -40,7 +38,7 @@ class Trial:
         correct: (M,) bool, the disparity is right.
         valid: (M,) bool, ground truth is known; all False for a pair without.
         graphs: the Delaunay graphs of both views.
-        classification: the set tests; ``inlier`` follows the threshold, if there is one.
+        classification: the set tests; ``inlier`` follows the score, if the setting wants that.
         score: (M,), higher is better; None if the setting asks for none.
         seconds: wall time of each of ``STAGES``, also where it was shared with other trials.
     """
@@ -81,7 +79,7 @@ class Trial:
             "score": config.score,
             "temperature": config.temperature if config.score == "topology" else None,
             "temperature_unit": config.temperature_unit if config.score == "topology" else None,
-            "threshold": config.threshold,
+            **{name: getattr(config, name) for name in CUTS},
             "num_matches": self.matches.num_matches,
             "num_valid": confusion.num_valid,
             "num_untested": int((self.classification.relation == Relation.UNTESTED).sum()),
@@ -135,7 +133,7 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
     keys["group"] = keys["perturb"], trial.objects if trial.constrained else None
     keys["graph"] = keys["group"], trial.tie_tolerance, trial.backend
     keys["relate"] = keys["graph"], trial.restriction, trial.min_group_size
-    measure = (trial.score, trial.temperature, trial.temperature_unit, trial.min_group_size)
+    measure = (trial.score, trial.temperature, trial.temperature_unit)
     keys["score"] = keys["graph"], None if trial.score == "none" else measure
     return keys
 
@@ -202,10 +200,9 @@ class TrialRunner:
             "relate",
             lambda: classify_graphs(graphs, restriction=trial.restriction, min_group_size=trial.min_group_size),
         )
-        score = share("score", lambda: self._score(matches, graphs, trial))
-        if trial.threshold is not None and score is not None:
-            tested = verdict.relation != int(Relation.UNTESTED)
-            verdict = replace(verdict, inlier=tested & (score >= trial.threshold))
+        score = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
+        if score is not None:
+            verdict, score = apply_score(verdict, score, matches.ptr, trial)
         return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, seconds)
 
     def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor, Tensor]:
@@ -222,22 +219,6 @@ class TrialRunner:
             unknown = torch.zeros(matches.num_matches, dtype=torch.bool)
             return matches, unknown, unknown
         return matches, *matches_against_gt(matches, [self.pair.disparity_gt], max_error_px=trial.max_error_px)
-
-    def _score(self, matches: Matches, graphs: MatchGraphs, trial: TrialConfig) -> Tensor | None:
-        if trial.score == "none":
-            return None
-        scorer = DelaunayFilter(
-            score=trial.score,
-            temperature=trial.temperature,
-            unit=trial.temperature_unit,
-            min_group_size=trial.min_group_size,
-            tie_tolerance=trial.tie_tolerance,
-            backend=trial.backend,
-        )
-        image0, image1 = ([image[0]] for image in self._gray[0])
-        evidence = measure_images(image0, image1, matches, graphs) if trial.score == "learned" else None
-        output: FilterOutput = scorer(matches, evidence=evidence)
-        return output.score
 
 
 def scene_name(pair: StereoPair) -> str:

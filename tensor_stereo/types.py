@@ -260,7 +260,7 @@ def check_tie_tolerance(tie_tolerance: float) -> None:
         raise ValueError(f"tie_tolerance must lie in [0, 1), got {tie_tolerance}")
 
 
-def check_unit(unit: str) -> None:
-    """Raise unless ``unit`` is one that a temperature can have."""
+def check_unit(unit: str, name: str = "unit") -> None:
+    """Raise unless ``unit`` is one that a temperature can have; ``name`` is that of the argument."""
     if unit not in ("edge", "px"):
-        raise ValueError(f"unit must be 'edge' or 'px', got {unit!r}")
+        raise ValueError(f"{name} must be 'edge' or 'px', got {unit!r}")

@@ -251,7 +251,7 @@ def test_cuda_tensors_come_back_on_their_device() -> None:
     [
         ({"restriction": "cardinal"}, "restriction"),
         ({"score": "best"}, "score"),
-        ({"unit": "cm"}, "unit"),
+        ({"temperature_unit": "cm"}, "temperature_unit"),
         ({"temperature": 0.0}, "temperature"),
         ({"temperature": np.nan}, "temperature"),
         ({"threshold": 7.0}, "threshold"),

@@ -183,7 +183,7 @@ def test_gradients_are_finite_everywhere(
     module = ts.DelaunayFilter(
         score="topology",
         temperature=temperature,
-        unit=unit,
+        temperature_unit=unit,
         learnable_temperature=True,
         min_group_size=1,
         tie_tolerance=tie_tolerance,

@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tensor_stereo.configs import FASTConfig, MatchingConfig, SIFTConfig, TrialConfig
+from tensor_stereo.configs import SCORES, FASTConfig, MatchingConfig, Score, SIFTConfig, TrialConfig
 from tensor_stereo.datasets.synthetic import render_pair
 from tensor_stereo.metrics import roc_auc, specificity_at_sensitivity
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.pipeline import run_pipeline
+from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.trials import SCORE_BINS, STAGES, TrialRunner, stage_keys
 
 PAIR = render_pair(0)
@@ -42,6 +43,22 @@ def test_a_trial_is_the_pipeline(constrained: bool) -> None:
     assert torch.equal(found.classification.inlier, expected.classification.inlier)
     score = DelaunayFilter(restriction="adjacency", min_group_size=2)(found.matches).score
     assert torch.equal(found.score, score)
+    assert torch.equal(found.score, expected.score)
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+@pytest.mark.parametrize("score", SCORES)
+def test_the_score_is_that_of_the_module(score: Score, constrained: bool) -> None:
+    trial = TrialConfig(score=score, constrained=constrained, temperature=0.5, min_group_size=6, threshold=0.3)
+    found = TrialRunner(PAIR).run(trial)
+    evidence = None
+    if score == "learned":
+        evidence = measure_images([PAIR.image0], [PAIR.image1], found.matches, found.graphs)
+    module = DelaunayFilter(score=score, temperature=0.5, min_group_size=6, threshold=0.3)
+    expected = module(found.matches, evidence=evidence)
+    assert torch.equal(found.score, expected.score)
+    assert torch.equal(found.classification.inlier, expected.inlier)
+    assert 0 < found.classification.inlier.sum() < found.matches.num_matches
 
 
 def test_a_threshold_replaces_the_restriction() -> None:
@@ -92,13 +109,19 @@ def test_no_ground_truth_leaves_rates_open() -> None:
         ({"max_error_px": 2.0}, "perturb"),
         ({"constrained": True}, "group"),
         ({"tie_tolerance": 0.0}, "graph"),
+        ({"score": "learned"}, "score"),
         ({"threshold": 0.5}, None),
+        ({"min_precision": 0.5}, None),
+        ({"min_group_size": 7}, "relate"),
     ],
 )
 def test_a_setting_changes_the_stages_from_its_own_on(change: dict[str, object], first: str | None) -> None:
     before, after = stage_keys(TrialConfig()), stage_keys(replace(TrialConfig(), **change))
     changed = [stage for stage in STAGES if before[stage] != after[stage]]
-    assert changed == ([] if first is None else list(STAGES[STAGES.index(first) :]))
+    after_first = [] if first is None else list(STAGES[STAGES.index(first) :])
+    if first == "relate":
+        after_first.remove("score")  # the score knows no restriction and no least group
+    assert changed == after_first
 
 
 def test_the_ratio_of_sift_belongs_to_the_matcher() -> None:

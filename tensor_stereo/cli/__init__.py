@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import tyro
 
@@ -25,13 +25,16 @@ Command = (
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; bad input ends in one line on standard error and exit code 2."""
-    command: Any = tyro.cli(
-        Command,
-        prog="tensor-stereo",
-        description="Decide which putative stereo matches are right.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
+    try:
+        command: Any = tyro.cli(
+            Command,
+            prog="tensor-stereo",
+            description="Decide which putative stereo matches are right.",
+            args=arguments,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+        )
+    except ValueError as error:  # of the settings' own checks; tyro exits by itself
+        _fail(error)
     # torch is needed from here on; a sweep that only looks at what is done needs neither reports nor figures
     if isinstance(command, Sweep):
         from tensor_stereo.cli.sweep import run_sweep_command as run
@@ -42,10 +45,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = run(command)
     except (ValueError, TypeError, ImportError, SweepError, OSError) as error:
-        print(f"tensor-stereo: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        _fail(error)
     except KeyboardInterrupt:
         print("tensor-stereo: interrupted", file=sys.stderr)
         sys.exit(130)
     if code:
         sys.exit(code)
+
+
+def _fail(error: Exception) -> NoReturn:
+    print(f"tensor-stereo: {' '.join(str(error).split())}", file=sys.stderr)
+    sys.exit(2)

@@ -72,8 +72,6 @@ class Filter:
     """File to write, with the same ending."""
     keypoints: Path | None = None
     """hloc's file of features, for .h5."""
-    threshold: float | None = None
-    """Verdict by score instead of by restriction."""
     config: Annotated[ClassifyConfig, Flat] = field(default_factory=ClassifyConfig)
 
 

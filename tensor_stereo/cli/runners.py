@@ -61,9 +61,7 @@ def _run_index(command: Index) -> None:
 
 
 def _run_filter(command: Filter) -> None:
-    summary = filter_file(
-        command.matches, command.out, keypoints=command.keypoints, config=command.config, threshold=command.threshold
-    )
+    summary = filter_file(command.matches, command.out, keypoints=command.keypoints, config=command.config)
     for name, value in asdict(summary).items():
         print(f"{name:20}{value:8}")
 

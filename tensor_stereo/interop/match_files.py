@@ -30,7 +30,6 @@ def filter_file(
     *,
     keypoints: Path | None = None,
     config: ClassifyConfig | None = None,
-    threshold: float | None = None,
 ) -> FilterSummary:
     r"""Decide which matches of a file are right, and write the file again with verdict and score.
 
@@ -53,8 +52,7 @@ def filter_file(
         source: file of putative matches. It is not changed.
         out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced.
         keypoints: hloc's file of features; for ``.h5`` only.
-        config: settings of the verdict; None is ``ClassifyConfig()``.
-        threshold: verdict by score >= threshold instead of by the restriction.
+        config: settings of verdict and score; None is ``ClassifyConfig()``.
 
     Returns:
         Counts of pairs and matches.
@@ -78,7 +76,7 @@ def filter_file(
     config = ClassifyConfig() if config is None else config
     settings = {field.name: getattr(config, field.name) for field in fields(ClassifyConfig)}
     consensus = UNRECTIFIED if ending in (".h5", ".db") else None  # of any two views, as structure from motion has
-    run = DelaunayFilter(**settings, threshold=threshold, consensus=consensus)
+    run = DelaunayFilter(**settings, consensus=consensus)
     with whole_file(out) as target:
         if ending == ".npz":
             return filter_npz(source, target, run)

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tensor_stereo.configs import EvaluationConfig
+from tensor_stereo.configs import EvaluationConfig, describe_verdict
 from tensor_stereo.evaluation import PairEvaluation
 from tensor_stereo.features import to_gray
 from tensor_stereo.metrics import IsolatedCounts
@@ -39,7 +39,8 @@ def write_evaluation(
         out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.
 
     Returns:
-        Tables 1-4 for the detectors of ``config``, Table 5, run-time by stage, putative matches and isolated ones.
+        Tables 1-4 for the detectors of ``config``, how the score ranks matches, Table 5, run-time by stage, putative
+        matches and isolated ones.
 
     Raises:
         ValueError: if ``out`` holds the results of other settings.
@@ -77,7 +78,7 @@ def draw_evaluation(result: PairEvaluation, config: EvaluationConfig, path: Path
         valid=constrained.valid,
         contours0=contours[0],
         contours1=contours[1],
-        title=f"{pair.name}, {result.detector.upper()}, {config.restriction}, constrained by objects",
+        title=f"{pair.name}, {result.detector.upper()}, {describe_verdict(vars(config))}, constrained by objects",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_figure(figure, path)

@@ -9,7 +9,7 @@ import polars as pl
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tensor_stereo.configs import PipelineConfig
+from tensor_stereo.configs import PipelineConfig, describe_verdict
 from tensor_stereo.datasets import PairFiles, read_pair
 from tensor_stereo.features import to_gray
 from tensor_stereo.metrics import Rates, match_rates, matches_against_gt
@@ -88,9 +88,9 @@ def classify_files(
 def match_table(output: PipelineOutput, truth: Truth | None = None) -> pl.DataFrame:
     """One row per match of one pair.
 
-    Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained, ``inlier``,
-    ``relation`` by name, ``overlap, degree0, degree1``, and with ``truth`` = (correct, valid) also ``correct``, null
-    where ground truth is not known.
+    Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained, ``inlier``, ``score``
+    if there is one, ``relation`` by name, ``overlap, degree0, degree1``, and with ``truth`` = (correct, valid) also
+    ``correct``, null where ground truth is not known.
     """
     matches, verdict = output.matches, output.classification
     columns = {
@@ -102,6 +102,7 @@ def match_table(output: PipelineOutput, truth: Truth | None = None) -> pl.DataFr
         "cost": matches.cost,
         "group": matches.group,
         "inlier": verdict.inlier,
+        "score": output.score,
         "relation": verdict.relation,
         "overlap": verdict.overlap,
         "degree0": verdict.degree0,
@@ -130,5 +131,5 @@ def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, trut
         valid=valid,
         contours0=contours[0] if contours else None,
         contours1=contours[1] if contours else None,
-        title=f"{pair.name}, {config.detector.upper()}, {config.restriction}",
+        title=f"{pair.name}, {config.detector.upper()}, {describe_verdict(vars(config))}",
     )

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tensor_stereo.configs import DETECTORS, Restriction
+from tensor_stereo.configs import DETECTORS, Restriction, describe_verdict
 
 Row = Mapping[str, Any]
 Cell = str | int | float
@@ -20,6 +20,7 @@ Key = tuple[str, str, str]  # scene, detector, variant
 SCENES = ("Art", "Books", "Cones", "Dolls", "Laundry", "Moebius", "Reindeer", "Teddy")  # order of the paper
 VARIANTS = ("unconstrained", "constrained")
 RATES = {"sensitivity": "sens.", "specificity": "spec.", "ppv": "PPV", "npv": "NPV"}
+SCORE_RATES = {"auc": "AUC", "specificity_at_sensitivity_96": "spec. at sens. .96"}
 UNDEFINED = "–"
 
 
@@ -60,7 +61,8 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
         restriction: the one whose records are shown.
 
     Returns:
-        Tables 1-4 as far as there are records, Table 5, the run-time by stage, and the putative matches.
+        Tables 1-4 as far as there are records, how the score ranks matches if there is one, Table 5, the run-time by
+        stage, and the putative matches.
 
     Raises:
         ValueError: if a record lacks a field, repeats another one, or names an unknown detector or variant.
@@ -69,8 +71,10 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
         >>> [table.title for table in paper_tables([])]  # doctest: +ELLIPSIS
         ['Table 5. Run-time...', 'Run-time by stage...', 'Putative matches...']
     """
+    scores = [score_table(rows, restriction=restriction)]
     return [
         *(rates_table(rows, detector, restriction=restriction) for detector in _detectors(_index(rows, restriction))),
+        *(table for table in scores if table.rows),
         runtime_table(rows, restriction=restriction),
         stage_table(rows, restriction=restriction),
         matches_table(rows, restriction=restriction),
@@ -96,12 +100,36 @@ def rates_table(rows: Sequence[Row], detector: str, *, restriction: Restriction 
     body = [
         (scene, *(_value(records.get((scene, detector, variant)), rate) for variant, rate in keys)) for scene in scenes
     ]
-    number = DETECTORS.index(detector) + 1
+    head = f"Table {DETECTORS.index(detector) + 1}. {detector.upper()}, {_verdict(records, restriction)}"
     return Table(
-        title=f"Table {number}. {detector.upper()}, {restriction}: unconstrained (U) and constrained by objects (C)",
+        title=f"{head}: unconstrained (U) and constrained by objects (C)",
         columns=("scene", *(f"{variant[0].upper()} {RATES[rate]}" for variant, rate in keys)),
         rows=_with_mean(body),
     )
+
+
+def score_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
+    """How the score ranks matches: area under the ROC curve, and specificity where the paper reads it.
+
+    Two rows per detector, without and with Restriction 3, as means over the scenes; none without a score.
+
+    Example:
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> record |= dict(score="consensus", auc=0.9, specificity_at_sensitivity_96=0.5)
+        >>> score_table([record]).text_rows()
+        [['FAST, constrained', '1', '0.900', '0.500']]
+    """
+    records = {key: row for key, row in _index(rows, restriction).items() if row.get("auc") is not None}
+    body: list[tuple[Cell, ...]] = []
+    for detector in _detectors(records):
+        for variant in VARIANTS:
+            found = [row for key, row in records.items() if key[1:] == (detector, variant)]
+            means = (_mean([_value(row, name) for row in found]) for name in SCORE_RATES)
+            if found:
+                body.append((f"{detector.upper()}, {variant}", len(found), *means))
+    names = ", ".join(dict.fromkeys(row["score"] for row in records.values()))
+    title = f"How the score ranks matches ({names or 'none'}), mean over the scenes"
+    return Table(title, ("matches", "scenes", *SCORE_RATES.values()), tuple(body), decimals=3)
 
 
 def runtime_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
@@ -112,8 +140,8 @@ def runtime_table(rows: Sequence[Row], *, restriction: Restriction = "cardinalit
         >>> runtime_table([record | {"seconds": {"detect": 0.01, "match": 0.02}}]).text_rows()[0]
         ['Art', '30.0']
     """
-    title = f"Table 5. Run-time of the constrained variant in ms, {restriction}"
     records = _index_variant(rows, restriction, "constrained")
+    title = f"Table 5. Run-time of the constrained variant in ms, {_verdict(records, restriction)}"
     milliseconds = {key: 1000 * sum(_field(record, "seconds").values()) for key, record in records.items()}
     detectors = _detectors(records)
     body = [
@@ -140,7 +168,8 @@ def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality"
         means = [1000 * _mean([scene.get(stage, math.nan) for scene in seconds]) for stage in stages]
         total = 1000 * _mean([sum(scene.values()) for scene in seconds])
         body.append((detector.upper(), *means, total))
-    title = f"Run-time by stage of the constrained variant in ms, {restriction}, mean over the scenes"
+    verdict = _verdict(records, restriction)
+    title = f"Run-time by stage of the constrained variant in ms, {verdict}, mean over the scenes"
     return Table(title, ("detector", *stages, "total"), tuple(body), decimals=1)
 
 
@@ -209,6 +238,11 @@ def _index(rows: Sequence[Row], restriction: Restriction) -> dict[Key, Row]:
 
 def _index_variant(rows: Sequence[Row], restriction: Restriction, variant: str) -> dict[Key, Row]:
     return {key: record for key, record in _index(rows, restriction).items() if key[2] == variant}
+
+
+def _verdict(records: Mapping[Key, Row], restriction: Restriction) -> str:
+    """What decided in the records of one evaluation, which agree about it."""
+    return next((describe_verdict(row) for row in records.values()), restriction)
 
 
 def _with_mean(body: Sequence[tuple[Cell, ...]]) -> tuple[tuple[Cell, ...], ...]:

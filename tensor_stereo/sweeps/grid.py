@@ -62,7 +62,7 @@ def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
     """The points of a union of products.
 
     Settings that a point does not use (other detectors, the seed where nothing is random, the temperature of another
-    score than topology, the restriction beside a threshold) are set to their defaults, and equal points are one.
+    score than topology, the restriction where the score decides) are set to their defaults, and equal points are one.
 
     Args:
         tables: settings as :func:`read_grid` describes them, nested by their dots.
@@ -102,7 +102,7 @@ def simplify(trial: TrialConfig) -> TrialConfig:
         unused["seed"] = _DEFAULT.seed
     if trial.score != "topology":
         unused |= {"temperature": _DEFAULT.temperature, "temperature_unit": _DEFAULT.temperature_unit}
-    if trial.threshold is not None:
+    if trial.by_score:
         unused["restriction"] = _DEFAULT.restriction
     if not trial.constrained:
         unused["objects"] = ObjectsConfig()

@@ -121,6 +121,36 @@ def test_bad_input_is_one_line_and_exit_code_2(scene: Path, tmp_path: Path, caps
     fails(["evaluate", str(tmp_path)], capsys, "looked for")
     fails(["evaluate", str(scene), "--scenes", "Atlantis"], capsys, "Atlantis", "rendered")
     fails(["classify", left, right, "--min-group-size", "0"], capsys, "min_group_size")
+    fails(["classify", left, right, "--threshold", "3"], capsys, "threshold", "[0, 1]")
+    fails(["evaluate", str(scene), "--score", "topology", "--min-precision", "0.9"], capsys, "calibrated")
+
+
+@pytest.mark.parametrize("score", ["consensus", "learned", "topology"])
+def test_the_score_can_decide(scene: Path, tmp_path: Path, score: str) -> None:
+    out, images = tmp_path / "matches.parquet", [str(scene / "im0.png"), str(scene / "im1.png")]
+    main(["classify", *images, "--out", str(out), "--score", score, "--threshold", "0.4"])
+    table = pl.read_parquet(out)
+    tested = table["relation"] != "UNTESTED"
+    assert table["inlier"].equals((table["score"] >= 0.4) & tested)
+    assert 0 < table["inlier"].sum() < len(table)
+    if score != "topology":
+        main(["classify", *images, "--out", str(out), "--score", score, "--min-precision", "0.9"])
+        aimed = pl.read_parquet(out)
+        least = aimed.filter(pl.col("inlier"))["score"].min()
+        assert aimed["inlier"].equals((aimed["score"] >= least) & tested)
+        assert not aimed["inlier"].equals(table["inlier"])
+    main(["classify", *images, "--out", str(out), "--score", "none"])
+    assert "score" not in pl.read_parquet(out).columns
+
+
+def test_tables_name_the_score_that_decided(scene: Path, capsys: pytest.CaptureFixture) -> None:
+    command = ["evaluate", str(scene), "--detectors", "fast", "--score", "learned", "--target-sensitivity", "0.9"]
+    main(command)
+    printed = capsys.readouterr().out
+    assert "Table 2. FAST, learned, target sensitivity 0.9:" in printed
+    assert "How the score ranks matches (learned)" in printed
+    main([*command[:-4], "--score", "none"])
+    assert "How the score" not in capsys.readouterr().out
 
 
 def test_constant_images_give_an_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tensor_stereo import Matches
+from tensor_stereo import DelaunayFilter, Matches
 from tensor_stereo.batching import ptr_to_batch, split_matches
 from tensor_stereo.configs import UNRECTIFIED, ClassifyConfig, PipelineConfig
 from tensor_stereo.interop import match_files
@@ -19,6 +19,7 @@ from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.match_batches import batch, expected
 
 ENDINGS = (".npz", ".csv", ".parquet", ".h5", ".db")
+SET_TEST = {"restriction": "adjacency", "min_group_size": 1, "tie_tolerance": 0.01, "backend": "scipy"}
 
 
 def write_source(folder: Path, ending: str, matches: Matches) -> dict[str, Any]:
@@ -107,18 +108,22 @@ def test_settings_reach_the_filter(tmp_path: Path, ending: str) -> None:
     matches = batch(1, [60])
     matches = Matches(*(points.float().double() for points in (matches.keypoints0, matches.keypoints1)), matches.ptr)
     arguments = write_source(tmp_path, ending, matches)
-    config = ClassifyConfig(restriction="adjacency", min_group_size=1, tie_tolerance=0.01, backend="scipy")
+    config = ClassifyConfig(**SET_TEST)  # type: ignore[arg-type]
     consensus = UNRECTIFIED if ending in (".h5", ".db") else None
     assert_verdicts(
         arguments["out"],
         filter_file(**arguments, config=config),
-        expected(matches, consensus=consensus, **vars(config)),
+        expected(matches, consensus=consensus, **SET_TEST),
     )
     pipeline = PipelineConfig(restriction="adjacency")
     summary = filter_file(**arguments, config=pipeline)
     assert_verdicts(arguments["out"], summary, expected(matches, consensus=consensus, restriction="adjacency"))
-    summary = filter_file(**arguments, threshold=0.5)  # replaces what is there
+    summary = filter_file(**arguments, config=ClassifyConfig(threshold=0.5))  # replaces what is there
     assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.5, consensus=consensus))
+    for settings in ({"score": "learned"}, {"score": "topology", "temperature": 0.3}, {"min_precision": 0.8}):
+        filter_file(**arguments, config=ClassifyConfig(**settings))  # type: ignore[arg-type]
+        output = DelaunayFilter(**settings, consensus=consensus)(matches)  # type: ignore[arg-type]
+        assert read_inliers(arguments["out"]) == output.inlier.tolist()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -178,8 +183,8 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         filter_file(tmp_path / "folder.csv", out)
     with pytest.raises(FileNotFoundError, match="out: there is no folder"):
         filter_file(source, tmp_path / "none" / "out.csv")
-    with pytest.raises(ValueError, match=r"threshold must lie in \[0, 1\]"):
-        filter_file(source, out, threshold=2)
+    with pytest.raises(ValueError, match="score must be one of"):
+        filter_file(source, out, config=ClassifyConfig(score="none"))
     with pytest.raises(ValueError, match="restriction must be"):
         filter_file(source, out, config=ClassifyConfig(restriction="none"))  # type: ignore[arg-type]
 

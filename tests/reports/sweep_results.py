@@ -56,6 +56,8 @@ def make_grid(
             "temperature": None if score == "none" else 1.0,
             "temperature_unit": None if score == "none" else "edge",
             "threshold": threshold,
+            "target_sensitivity": None,
+            "min_precision": None,
         }
         for detector, variant, restriction, score, threshold, rate in itertools.product(*axes)
         for seed in seeds

@@ -12,11 +12,13 @@ from tensor_stereo.reports.tables import (
     paper_tables,
     rates_table,
     runtime_table,
+    score_table,
     stage_table,
     to_markdown,
 )
 
 RATES = ("sensitivity", "specificity", "ppv", "npv")
+SPECIFICITY = "specificity_at_sensitivity_96"
 STAGES = ("detect", "match", "group", "graph", "relate")
 
 
@@ -83,6 +85,31 @@ def test_undefined_rate_prints_as_dash_and_is_left_out_of_the_mean() -> None:
         row["ppv"] = 0.25 if row["scene"] == "Art" else None  # as read back from JSON, which has no NaN
     table = rates_table(rows, "sift")
     assert [row[3:5] for row in table.text_rows()] == [["0.25", "–"], ["–", "–"], ["0.25", "–"]]
+
+
+def test_scores_are_means_over_the_scenes_and_left_out_without_score() -> None:
+    rows = records(("Art", "Books", "Cones"), ("fast", "sift"))
+    assert "How the score" not in " ".join(table.title for table in paper_tables(rows))
+    draw = random.Random(1)
+    for row in rows:
+        row |= {"score": "learned", "auc": draw.random(), "specificity_at_sensitivity_96": draw.random()}
+    pick(rows, scene="Art", detector="sift", variant="constrained", restriction="adjacency")["auc"] = None
+    table = score_table(rows, restriction="adjacency")
+    assert [row[0] for row in table.rows] == [
+        f"{detector}, {variant}" for detector in ("SIFT", "FAST") for variant in ("unconstrained", "constrained")
+    ]
+    of = [r for r in rows if (r["detector"], r["variant"], r["restriction"]) == ("fast", "constrained", "adjacency")]
+    assert table.rows[3][1:] == (3, sum(r["auc"] for r in of) / 3, sum(r[SPECIFICITY] for r in of) / 3)
+    assert table.rows[1][1] == 2
+    assert "learned" in table.title
+    assert any(shown.rows == score_table(rows).rows for shown in paper_tables(rows))
+
+
+def test_titles_name_the_score_that_decides() -> None:
+    rows = [row | {"score": "consensus", "threshold": 0.25} for row in records(("Art",), ("fast",))]
+    for table in (rates_table(rows, "fast"), runtime_table(rows), stage_table(rows)):
+        assert "consensus, threshold 0.25" in table.title
+        assert "cardinality" not in table.title
 
 
 def test_missing_scene_is_a_dash() -> None:

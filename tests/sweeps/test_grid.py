@@ -50,6 +50,7 @@ def test_an_empty_grid_is_the_default_trial(tmp_path: Path) -> None:
         {"sift": {"max_keypoints": [5, 6]}},
         {"score": "none", "temperature": [0.5, 1.0], "temperature_unit": ["edge", "px"]},
         {"threshold": 0.5, "restriction": ["adjacency", "cardinality"]},
+        {"min_precision": 0.5, "restriction": ["adjacency", "cardinality"]},
         {"objects": {"element_px": [3, 5]}},
     ],
 )

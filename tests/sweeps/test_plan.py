@@ -54,7 +54,7 @@ def test_costs_are_what_a_runner_does(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = dict.fromkeys(STAGES, 0)
     stages = {
         "detect": "detect_pairs", "match": "match_features", "perturb": "matches_against_gt",
-        "group": "group_matches", "graph": "build_match_graphs", "relate": "classify_graphs", "score": "DelaunayFilter",
+        "group": "group_matches", "graph": "build_match_graphs", "relate": "classify_graphs", "score": "score_pairs",
     }  # fmt: skip
     for stage, name in stages.items():
         original = getattr(trials, name)

@@ -20,7 +20,7 @@ from tensor_stereo.reports.sweep.drawing import (
     run_prefix,
     telling_names,
 )
-from tensor_stereo.reports.sweep.pooling import PERTURBATIONS, order_detectors
+from tensor_stereo.reports.sweep.pooling import PERTURBATIONS, decided_by_score, order_detectors
 from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.sweep.svg import INK, Key, Plot, legend, rate_axis
 
@@ -55,7 +55,7 @@ def curve_figures(runs: Sequence[RunResults]) -> str:
     keys = [
         Key("verdict of Restriction 2 (cardinality)", INK, shape="circle"),
         Key("verdict of Restriction 1 (adjacency)", INK, shape="triangle"),
-        Key("verdict by threshold", INK, shape="diamond"),
+        Key("verdict by score", INK, shape="diamond"),
         Key(PAPER_CLAIM, INK, shape="star"),
         Key("chance", INK, line=True, style="chance"),
     ]
@@ -99,7 +99,7 @@ def _figure(
     verdicts += [(k, row, INK) for k, of_run in enumerate(of_runs) if of_run for row in of_run.verdicts]
     seen: set[tuple[Any, ...]] = set()
     for k, row, color in verdicts:
-        shape = "diamond" if row["threshold"] is not None else _VERDICTS.get(row["restriction"], "circle")
+        shape = "diamond" if decided_by_score(row) else _VERDICTS.get(row["restriction"], "circle")
         place = k, row["sensitivity"], row["specificity"], shape
         if place in seen:  # settings without an effect on the verdict
             continue

@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 import torch
 
-from tensor_stereo.configs import DETECTORS
+from tensor_stereo.configs import CUTS, DETECTORS
 from tensor_stereo.metrics import Confusion, ScoreCounts
 from tensor_stereo.reports.sweep.results import COUNTS
 from tensor_stereo.trials import SCORE_BINS, SENSITIVITY
@@ -44,6 +44,8 @@ SETTINGS = {
     "temperature": Setting("temperature"),
     "temperature_unit": Setting("unit"),
     "threshold": Setting("threshold", "set test"),
+    "target_sensitivity": Setting("target sens."),
+    "min_precision": Setting("min. precision"),
 }
 CELLS = ("true_positive", "false_positive", "true_negative", "false_negative")
 TOTALS = ("num_matches", "num_valid", "num_untested", *CELLS)
@@ -103,13 +105,22 @@ def settings_label(row: Mapping[str, Any], names: Sequence[str]) -> str:
     parts = []
     for name in names:
         text = setting_text(name, row[name])
-        if text == Setting.none:
+        if text == Setting.none or (text == SETTINGS["threshold"].none and decided_by_score(row)):
             continue
         if name == "score" and text == "none":
             text = "no score"
         itself = isinstance(row[name], str) or (row[name] is None and name == "threshold")
         parts.append(text if itself else f"{SETTINGS[name].heading} {text}")
     return ", ".join(parts) or "all settings alike"
+
+
+def decided_by_score(row: Mapping[str, Any]) -> bool:
+    """Whether the verdict of a row is one of the score; the row may lack settings.
+
+    >>> decided_by_score({"restriction": "adjacency", "threshold": None}), decided_by_score({"min_precision": 0.9})
+    (False, True)
+    """
+    return any(row.get(name) is not None for name in CUTS)
 
 
 def mildest(results: pl.DataFrame) -> pl.DataFrame:

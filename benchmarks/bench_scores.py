@@ -1,0 +1,39 @@
+"""Graphs, verdict and score of a batch, against the hard verdict alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from harness import Suite, matched_points
+
+import tensor_stereo as ts
+from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.scores.consensus import consensus_score
+
+PAIRS, COUNT = 64, 1000
+
+
+def plain_consensus(matches: ts.Matches) -> torch.Tensor:
+    """Native graphs, and the score in plain torch."""
+    return consensus_score(matches, build_match_graphs(matches), backend="scipy")
+
+
+@torch.inference_mode()
+def main() -> None:
+    suite = Suite("scores")
+    for kind in ("float", "integer"):
+        pairs = [matched_points(kind, COUNT, 10 * b) for b in range(PAIRS)]
+        left, right = (torch.from_numpy(np.concatenate(view)) for view in zip(*pairs, strict=True))
+        matches = ts.Matches(left, right, torch.arange(PAIRS + 1) * COUNT)
+        filters = {name: ts.DelaunayFilter(score=name) for name in ("topology", "consensus", "learned")}
+        cases = {"classify_matches": lambda m=matches: ts.classify_matches(m)}
+        cases |= {name: lambda m=matches, f=f: f(m) for name, f in filters.items()}
+        cases["consensus in plain torch"] = lambda m=matches: plain_consensus(m)
+        for threads in (1, 2):
+            title = f"score, {kind}, {PAIRS} pairs x {COUNT} matches"
+            suite.compare(title, cases, threads=threads, units=PAIRS, repeats=min(9, suite.options.repeats))
+    suite.write()
+
+
+if __name__ == "__main__":
+    main()

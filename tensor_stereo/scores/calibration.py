@@ -1,0 +1,86 @@
+"""Verdicts that aim at a rate: what a calibrated score lets expect, and the matches of each pair that fulfil it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.batching import ptr_to_batch
+
+# Slope and bias of a logistic regression on the log-odds of the score (Platt 1999), rectified or not; fitted by
+# benchmarks/calibrate_consensus.py on the real scenes of the training set.
+_CONSENSUS = {True: (0.59, 2.60), False: (0.65, 2.25)}
+_LEAST = 1e-4  # probability, of either outcome
+_PARTS = 2**32  # of one match; whole numbers add up to the same in any order
+
+
+def calibrate_consensus(score: Tensor, *, rectified: bool = True) -> Tensor:
+    """The probability that a match is correct, from its consensus score.
+
+    Args:
+        score: (M,) as :func:`tensor_stereo.scores.consensus.consensus_score` gives it.
+        rectified: whether the row offset was evidence.
+
+    Returns:
+        (M,) float64, growing with the score. Gradients flow where the score is not saturated.
+
+    >>> calibrate_consensus(torch.tensor([0.0, 0.5, 1.0]))
+    tensor([0.0555, 0.9309, 0.9997], dtype=torch.float64)
+    """
+    slope, bias = _CONSENSUS[rectified]
+    return torch.sigmoid(slope * torch.logit(score.double(), eps=_LEAST) + bias)
+
+
+@torch.no_grad()
+def keep_by_target(
+    probability: Tensor,
+    tested: Tensor,
+    ptr: Tensor,
+    *,
+    target_sensitivity: float | None = None,
+    min_precision: float | None = None,
+) -> Tensor:
+    """In every pair, keep as many of the likeliest matches as the target allows.
+
+    The number of incorrect matches among some is expected to be the sum of 1 - probability. Matches of one probability
+    are kept together or not at all.
+
+    Args:
+        probability: (M,) calibrated, of each match being correct.
+        tested: (M,) bool; other matches are rejected and do not count.
+        ptr: (B + 1,) int64 offsets.
+        target_sensitivity: least expected fraction of the incorrect matches that is rejected.
+        min_precision: least expected fraction of the kept matches that is correct; given instead.
+
+    Returns:
+        (M,) bool. Pairs do not depend on each other, nor on the order of their matches.
+
+    Raises:
+        ValueError: unless just one target is given.
+
+    >>> probability = torch.tensor([0.9, 0.2, 0.8, 0.5])
+    >>> keep_by_target(probability, probability > 0, torch.tensor([0, 4]), min_precision=0.7)
+    tensor([ True, False,  True,  True])
+    """
+    if (target_sensitivity is None) == (min_precision is None):
+        raise ValueError(f"give target_sensitivity or min_precision, got {target_sensitivity} and {min_precision}")
+    batch = ptr_to_batch(ptr)
+    likely = torch.where(tested, probability.double(), -1)
+    order = likely.argsort(descending=True, stable=True)
+    order = order[batch[order].argsort(stable=True)]  # pairs stay in place, the likeliest of each first
+    value = likely[order]
+    risk = torch.where(tested[order], (1 - value) * _PARTS, 0).round().long()
+    so_far = torch.nn.functional.pad(risk.cumsum(0), (1, 0))
+    begin, end = ptr[:-1][batch], ptr[1:][batch]
+    wrong = so_far[1:] - so_far[begin]  # expected among the matches down to this one
+    if min_precision is None:
+        limit = (1 - target_sensitivity) * (so_far[end] - so_far[begin])  # type: ignore[operator]
+    else:
+        count = torch.arange(1, len(batch) + 1, device=batch.device) - begin
+        limit = (1 - min_precision) * _PARTS * count
+    is_last = torch.ones_like(tested)  # of equal ones
+    is_last[:-1] = (value.diff() != 0) | (batch.diff() != 0)
+    fulfils = tested[order] & is_last & (wrong <= limit)
+    least = torch.full_like(ptr[:-1], torch.inf, dtype=torch.float64)
+    least.scatter_reduce_(0, batch, torch.where(fulfils, value, torch.inf), "amin")
+    return tested & (likely >= least[batch])

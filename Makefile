@@ -65,7 +65,7 @@ fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFu
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
 
 BENCH_VENV ?= .venv-bench
-SUITES := graphs relations classify soft matching pipeline scaling adversarial sweep
+SUITES := graphs relations classify soft matching pipeline scaling adversarial sweep scores accuracy
 
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)
 	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)

@@ -30,8 +30,10 @@ from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.learned import LearnedScore, load_learned
 
 BAD_PX = 2.0
+MIN_GAP = 0.002  # of bad-2px, between the best peer and the oracle
 MAX_STEP_PX = 4.0  # where triangles are cut; of 2, 4, 8 and 16 the best on the training scenes
-NUM_THRESHOLDS = 13  # quantiles of each score, of correct and of other matches of the training scenes
+NUM_THRESHOLDS = 13  # quantiles of a peer's score, of correct and of other matches of the training scenes
+SHARED_THRESHOLDS = np.arange(1, 20) / 20  # of our scores, which mean the same for all kinds of matches
 GRID_PX = 8  # of ground-truth correspondences for the epipolar distance
 RANSAC_ERROR_PX, CONFIDENCE = 1.0, 0.999
 FITS = {"8-point": cv2.FM_8POINT, "LMedS": cv2.FM_LMEDS, "RANSAC": cv2.FM_RANSAC}
@@ -44,6 +46,7 @@ FILTERS = ("none", "paper R1+R2", *PEERS, *OURS, "learned, 0.5", "oracle")
 Rows = np.ndarray  # (M,) bool
 Scored = dict[str, np.ndarray]
 Case = tuple[GrayPair, Putatives, Scored]
+Tried = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def load_folds(work: Path) -> dict[str, LearnedScore]:
@@ -119,17 +122,30 @@ def measure_geometry(pair: GrayPair, one: Putatives, kept: Rows) -> dict[str, fl
     return errors
 
 
-def choose_thresholds(cases: list[Case]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """For each score its thresholds (T,) and the bad-2px (S, T) of each scene at each of them."""
-    chosen = {}
+def try_thresholds(cases: list[Case]) -> Tried:
+    """For each score some thresholds (T,), and the bad-2px (S, T) of each scene at each of them."""
+    tried = {}
+    right = np.concatenate([one.correct & one.valid for _, one, _ in cases])
     for name in SCORES:
         pooled = np.concatenate([scores[name] for *_, scores in cases])
-        right = np.concatenate([one.correct & one.valid for _, one, _ in cases])
         shares = np.linspace(0, 0.96, NUM_THRESHOLDS)
-        thresholds = np.unique([np.quantile(part, shares) for part in (pooled[right], pooled[~right])])
+        quantiles = np.unique([np.quantile(part, shares) for part in (pooled[right], pooled[~right])])
+        thresholds = SHARED_THRESHOLDS if name in OURS else quantiles
         bad = [[measure_maps(pair, one, s[name] >= t)["bad2"] for t in thresholds] for pair, one, s in cases]
-        chosen[name] = thresholds, np.array(bad)
-    return chosen
+        tried[name] = thresholds, np.array(bad)
+    return tried
+
+
+def choose_thresholds(tried: list[Tried], scenes: Rows) -> list[dict[str, float]]:
+    """The thresholds with the least mean bad-2px: of peers one for each kind of matches, of ours one for all kinds."""
+    shared = {}
+    for name in OURS:
+        mean = np.mean([of_kind[name][1][scenes].mean(0) for of_kind in tried], 0)
+        shared[name] = float(SHARED_THRESHOLDS[mean.argmin()])
+    own = [{name: of_kind[name] for name in PEERS} for of_kind in tried]
+    return [
+        {name: float(t[bad[scenes].mean(0).argmin()]) for name, (t, bad) in of_kind.items()} | shared for of_kind in own
+    ]
 
 
 def keep(scores: Scored, name: str, thresholds: dict[str, float]) -> Rows:
@@ -148,10 +164,15 @@ def report(suite: Suite, title: str, table: dict[str, dict[str, np.ndarray]], th
         print(f"  {name:28}" + "  ".join(f"{key} {value:8.3f}" for key, value in middle.items()), flush=True)
     bad = {name: figures["bad2"].mean() for name, figures in table.items()}
     peer = min(PEERS, key=bad.__getitem__)
+    gap = bad[peer] - bad["oracle"]
     for name in (*OURS, "learned, 0.5"):
-        closed = (bad[peer] - bad[name]) / (bad[peer] - bad["oracle"])
-        suite.records.append({"putatives": title, "filter": name, "best_peer": peer, "gap_closed": closed})
-        print(f"  {name:28} closes {closed:+.2f} of the gap from {peer} to the oracle", flush=True)
+        gain = bad[peer] - bad[name]
+        closed = gain / gap if gap > MIN_GAP else None  # of nothing there is no share
+        suite.records.append({
+            "putatives": title, "filter": name, "best_peer": peer, "gap": gap, "gain": gain, "gap_closed": closed,
+        })  # fmt: skip
+        share = "" if closed is None else f", {closed:+.2f} of it"
+        print(f"  {name:28} gains {gain:+.4f} on {peer}, the oracle {gap:+.4f}{share}", flush=True)
 
 
 def measure_depth(pair: GrayPair, one: Putatives, kept: Rows, doffs_px: float) -> dict[str, float]:
@@ -168,47 +189,31 @@ def find_offsets(root: Path) -> dict[str, float]:
     return {scene: read_calibration(file).doffs_px for scene, file in found.items() if file.is_file()}
 
 
-def run(
-    suite: Suite,
-    pairs: dict[str, list[GrayPair]],
-    offsets: dict[str, float],
-    folds: dict[str, LearnedScore],
-    detector: str,
-    gated: bool,
-) -> dict[str, dict[str, np.ndarray]]:
-    """Everything about one kind of putative matches; the table of the eight scenes."""
-    title = f"{detector}{', gated' if gated else ''}"
-    found = {g: [find_putatives(pair, detector, gated=gated) for pair in pairs[g]] for g in pairs}
+def find_cases(
+    pairs: dict[str, list[GrayPair]], folds: dict[str, LearnedScore], detector: str, gated: bool
+) -> dict[str, list[Case]]:
+    """The putative matches of one kind of all pairs, and their scores."""
     networks = {"training": [folds[pair.scene] for pair in pairs["training"]]}
     networks["eight"] = [load_learned()] * len(pairs["eight"])
-    cases = {
-        g: [
-            (pair, one, score_filters(pair, one, net))
-            for pair, one, net in zip(pairs[g], found[g], networks[g], strict=True)
-        ]
-        for g in pairs
-    }
-    chosen = choose_thresholds(cases["training"])
-    best = {name: float(t[bad.mean(0).argmin()]) for name, (t, bad) in chosen.items()}
+    cases: dict[str, list[Case]] = {}
+    for group, members in pairs.items():
+        found = [find_putatives(pair, detector, gated=gated) for pair in members]
+        scores = [score_filters(*case) for case in zip(members, found, networks[group], strict=True)]
+        cases[group] = list(zip(members, found, scores, strict=True))
+    return cases
+
+
+def measure_filters(cases: list[Case], best: dict[str, float]) -> dict[str, dict[str, np.ndarray]]:
+    """Filter -> figure -> (S,)."""
     table = {}
     for name in FILTERS:
         rows = []
-        for pair, one, scores in cases["eight"]:
+        for pair, one, scores in cases:
             kept = keep(scores, name, best)
             cut = measure_maps(pair, one, kept, MAX_STEP_PX)
             whole = measure_maps(pair, one, kept) | {"bad2_cut": cut["bad2"], "epe_cut_px": cut["epe_px"]}
             rows.append(whole | measure_geometry(pair, one, kept))
         table[name] = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-    report(suite, title, table, best)
-    if title == "fast":
-        show_maps(next(case for case in cases["eight"] if case[0].scene == SHOWN_SCENE), best)
-    # The scenes with a calibration are among those that choose the thresholds: here they do not.
-    others = np.array([pair.scene not in offsets for pair in pairs["training"]])
-    best = {name: float(t[bad[others].mean(0).argmin()]) for name, (t, bad) in chosen.items()}
-    for pair, one, scores in (case for case in cases["training"] if case[0].scene in offsets):
-        for name in FILTERS:
-            error = measure_depth(pair, one, keep(scores, name, best), offsets[pair.scene])
-            suite.note(f"depth, {title}, {pair.scene}, {name}", **error)
     return table
 
 
@@ -229,11 +234,26 @@ def main() -> None:
     groups = load_pairs(suite.options.data)
     pairs = {group: groups[group] for group in ("training", "eight")}
     offsets, folds = find_offsets(suite.options.data), load_folds(suite.options.folds)
+    kinds = {
+        f"{detector}{', gated' if gated else ''}": find_cases(pairs, folds, detector, gated)
+        for detector in DETECTORS
+        for gated in (False, True)
+    }
+    tried = [try_thresholds(cases["training"]) for cases in kinds.values()]
+    # The scenes with a calibration measure depth; there they choose no threshold.
+    measured = np.array([pair.scene in offsets for pair in pairs["training"]])
+    best, best_of_others = (choose_thresholds(tried, scenes) for scenes in (measured | True, ~measured))
     tables = {}
-    for detector in DETECTORS:
-        for gated in (False, True):
-            title = f"{detector}{', gated' if gated else ''}"
-            tables[title] = run(suite, pairs, offsets, folds, detector, gated)
+    for title, thresholds, others in zip(kinds, best, best_of_others, strict=True):
+        cases = kinds[title]
+        tables[title] = measure_filters(cases["eight"], thresholds)
+        report(suite, title, tables[title], thresholds)
+        if title == "fast":
+            show_maps(next(case for case in cases["eight"] if case[0].scene == SHOWN_SCENE), thresholds)
+        for pair, one, scores in (case for case in cases["training"] if case[0].scene in offsets):
+            for name in FILTERS:
+                error = measure_depth(pair, one, keep(scores, name, others), offsets[pair.scene])
+                suite.note(f"depth, {title}, {pair.scene}, {name}", **error)
     draw_bars(tables)
     suite.write()
 

@@ -50,6 +50,6 @@ def _duration(seconds: float) -> str:
 
 
 if __name__ == "__main__":
-    print_comparisons("classify", "graphs", "matching", "pipeline", "soft")
+    print_comparisons("classify", "graphs", "matching", "pipeline", "soft", "scores")
     print()
     print_scores()

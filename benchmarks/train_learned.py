@@ -197,7 +197,7 @@ def fit_calibration(logit: Tensor, correct: Tensor, weight: Tensor) -> Tensor:
         probability = torch.sigmoid(columns @ beta)
         gradient = columns.T @ (weight * (probability - target))
         hessian = (columns * (weight * probability * (1 - probability))[:, None]).T @ columns
-        beta = beta - torch.linalg.solve(hessian, gradient)
+        beta = beta - torch.linalg.solve(hessian, gradient).clamp(-1, 1)
     return beta.float()
 
 

@@ -32,8 +32,8 @@ from tensor_stereo.scores.learned import LearnedScore, load_learned
 BAD_PX = 2.0
 MIN_GAP = 0.002  # of bad-2px, between the best peer and the oracle
 MAX_STEP_PX = 4.0  # where triangles are cut; of 2, 4, 8 and 16 the best on the training scenes
-NUM_THRESHOLDS = 13  # quantiles of a peer's score, of correct and of other matches of the training scenes
-SHARED_THRESHOLDS = np.arange(1, 20) / 20  # of our scores, which mean the same for all kinds of matches
+NUM_THRESHOLDS = 13  # quantiles of each other score, of correct and of other matches of the training scenes
+PROBABILITIES = np.arange(1, 20) / 20  # thresholds of the learned score, which mean the same for all kinds of matches
 GRID_PX = 8  # of ground-truth correspondences for the epipolar distance
 RANSAC_ERROR_PX, CONFIDENCE = 1.0, 0.999
 FITS = {"8-point": cv2.FM_8POINT, "LMedS": cv2.FM_LMEDS, "RANSAC": cv2.FM_RANSAC}
@@ -130,21 +130,19 @@ def try_thresholds(cases: list[Case]) -> Tried:
         pooled = np.concatenate([scores[name] for *_, scores in cases])
         shares = np.linspace(0, 0.96, NUM_THRESHOLDS)
         quantiles = np.unique([np.quantile(part, shares) for part in (pooled[right], pooled[~right])])
-        thresholds = SHARED_THRESHOLDS if name in OURS else quantiles
+        thresholds = PROBABILITIES if name == "learned" else quantiles
         bad = [[measure_maps(pair, one, s[name] >= t)["bad2"] for t in thresholds] for pair, one, s in cases]
         tried[name] = thresholds, np.array(bad)
     return tried
 
 
 def choose_thresholds(tried: list[Tried], scenes: Rows) -> list[dict[str, float]]:
-    """The thresholds with the least mean bad-2px: of peers one for each kind of matches, of ours one for all kinds."""
-    shared = {}
-    for name in OURS:
-        mean = np.mean([of_kind[name][1][scenes].mean(0) for of_kind in tried], 0)
-        shared[name] = float(SHARED_THRESHOLDS[mean.argmin()])
-    own = [{name: of_kind[name] for name in PEERS} for of_kind in tried]
+    """The thresholds with the least mean bad-2px: one for each kind of matches, of a probability one for all kinds."""
+    mean = np.mean([of_kind["learned"][1][scenes].mean(0) for of_kind in tried], 0)
+    shared = {"learned": float(PROBABILITIES[mean.argmin()])}
     return [
-        {name: float(t[bad[scenes].mean(0).argmin()]) for name, (t, bad) in of_kind.items()} | shared for of_kind in own
+        {name: float(t[bad[scenes].mean(0).argmin()]) for name, (t, bad) in of_kind.items()} | shared
+        for of_kind in tried
     ]
 
 

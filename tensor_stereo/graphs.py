@@ -63,6 +63,20 @@ def build_graphs(
     return Adjacency(crow, cols, ptr)
 
 
+def check_match_graphs(matches: Matches, graphs: MatchGraphs) -> None:
+    """Raise unless the graphs have as many nodes as there are matches.
+
+    >>> import torch
+    >>> points = torch.tensor([[0.0, 0.0], [4.0, 0.0]])
+    >>> matches = Matches(points, points, torch.tensor([0, 2]))
+    >>> check_match_graphs(matches, build_match_graphs(matches))
+    """
+    for name in ("adjacency0", "adjacency1"):
+        adjacency: Adjacency = getattr(graphs, name)
+        if adjacency.num_nodes != matches.num_matches:
+            raise ValueError(f"graphs.{name} must have {matches.num_matches} nodes, got {adjacency.num_nodes}")
+
+
 def build_match_graphs(matches: Matches, *, tie_tolerance: float = 1e-3, backend: Backend = "auto") -> MatchGraphs:
     """Delaunay graphs of both views of every pair, over the rows of ``matches``.
 

@@ -197,21 +197,23 @@ def test_unrectified_pairs_and_negative_disparities_are_like_any_other() -> None
         assert torch.allclose(output.score, expected.score, atol=1e-9)
 
 
-@pytest.mark.parametrize("learnable", [False, True])
-def test_the_module_compiles_without_a_graph_break(learnable: bool) -> None:
-    _compare_compiled("aot_eager", learnable)
+@pytest.mark.parametrize(
+    "settings", [{}, {"min_precision": 0.9}, {"score": "topology", "learnable_temperature": True, "threshold": 0.4}]
+)
+def test_the_module_compiles_without_a_graph_break(settings: dict[str, object]) -> None:
+    _compare_compiled("aot_eager", settings)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler uses parts of torch that torch deprecates
 def test_the_module_compiles_with_inductor() -> None:
-    _compare_compiled("inductor", learnable=True)
+    _compare_compiled("inductor", {"score": "topology", "learnable_temperature": True})
 
 
-def _compare_compiled(backend: str, learnable: bool) -> None:
+def _compare_compiled(backend: str, settings: dict[str, object]) -> None:
     torch.compiler.reset()
-    module = ts.DelaunayFilter(score="topology" if learnable else "consensus", learnable_temperature=learnable)
+    module = ts.DelaunayFilter(**settings)  # type: ignore[arg-type]
 
     def loss(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         output = module(left, right)

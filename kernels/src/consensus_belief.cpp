@@ -13,7 +13,7 @@ namespace tensor_stereo {
 namespace {
 
 constexpr std::int64_t kGrain = 2048;
-constexpr double kCostFloor = 1e-2, kSpreadFloor = 0.1, kMaxEvidence = 8;  // as in the reference
+constexpr double kMaxCost = 1e300, kCostFloor = 1e-2, kSpreadFloor = 0.1, kMaxEvidence = 8;  // as in the reference
 constexpr double kVanished = 1492;  // exp(-x / 2) is zero beyond, and the library function slow to say so
 
 // Two numbers in one register, x and y or u and v: the compiler does not find such pairs by itself.
@@ -185,7 +185,7 @@ class Consensus {
         };
         double lowest = 0;  // costs of a pair that has negative ones count from the least
         for (std::int64_t row = begin; row < end; ++row) {
-            if (!std::isfinite(matches_.cost[row])) return;  // they say nothing
+            if (!(std::abs(matches_.cost[row]) <= kMaxCost)) return;  // they say nothing
             lowest = std::min(lowest, matches_.cost[row]);
         }
         const double typical = mean([&](std::int64_t row) { return matches_.cost[row] - lowest; });

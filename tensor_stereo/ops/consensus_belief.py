@@ -33,7 +33,11 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         for k in wanted:  # aliases, so that the second pass ends here
             arguments[k] = arguments[k].view_as(arguments[k])
         belief = reference_consensus.consensus_belief(*arguments, *ctx.settings)
-        found = torch.autograd.grad(belief, [arguments[k] for k in wanted], gradient, create_graph=twice)
+        if not belief.requires_grad:  # no round, no row offset and no cost: a constant
+            return (None,) * _NUM_ARGUMENTS
+        found = torch.autograd.grad(
+            belief, [arguments[k] for k in wanted], gradient, create_graph=twice, materialize_grads=True
+        )
     results: list[Tensor | None] = [None] * _NUM_ARGUMENTS
     for k, result in zip(wanted, found, strict=True):
         results[k] = result
@@ -70,13 +74,14 @@ def consensus_belief(
         keypoints0: (M, 2) float32 or float64 px of view 0.
         keypoints1: (M, 2) of view 1.
         ptr: (B + 1,) int64 offsets of the pairs.
-        cost: (M,) floating point, not negative, or None.
+        cost: (M,) floating point, or None. Those of a pair with negative ones count from the least, those of a pair
+            with any beyond 1e300 say nothing.
         crow0: (M + 1,) int64 row offsets of the graph of view 0.
         cols0: (nnz0,) int64 neighbours, of the same pair and distinct from the match in view 0.
         crow1: (M + 1,), of view 1.
         cols1: (nnz1,).
         tolerance_px: this and all that follow are the settings of
-            :class:`tensor_stereo.scores.consensus.ConsensusConfig`.
+            :class:`tensor_stereo.configs.ConsensusConfig`.
         whole_tolerance_px: for keypoints on whole pixels.
         row_tolerance_px: None: row offsets are no evidence.
         whole_row_tolerance_px: for keypoints on whole pixels.

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+_MAX_COST = 1e300  # so that sums of them stay finite
 _COST_FLOOR = 1e-2  # of the mean cost; keeps the logarithm of a perfect match finite
 _SPREAD_FLOOR = 0.1  # of the logarithm of the cost: alike costs are no evidence
 _MAX_EVIDENCE = 8.0  # log-odds
@@ -105,9 +106,10 @@ def _standardized_cost(cost: Tensor, pair: Tensor, count: Tensor) -> Tensor:
 
     Costs of a pair that has negative ones count from the least; those of a pair that has infinite ones say nothing.
     """
-    usable = (_mean(cost.isfinite().to(cost), pair, count) == 1).index_select(0, pair)
+    usable = (_mean((cost.abs() <= _MAX_COST).to(cost), pair, count) == 1).index_select(0, pair)
     cost = torch.where(usable, cost, 0)
-    lowest = cost.new_zeros(count.shape).scatter_reduce(0, pair, cost.detach(), "amin", include_self=True)
+    lowest = cost.new_zeros(count.shape).scatter_reduce(0, pair, cost, "amin", include_self=False)
+    lowest = torch.where(lowest < 0, lowest, 0)
     cost = cost - lowest.index_select(0, pair)
     mean = _mean(cost, pair, count)
     floor = torch.where(mean > 0, _COST_FLOOR * mean, 1).index_select(0, pair)  # any; so that gradients stay finite

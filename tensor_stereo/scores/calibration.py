@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tensor_stereo.batching import ptr_to_batch
-
 # Slope and bias of a logistic regression on the log-odds of the score (Platt 1999), rectified or not; fitted by
 # benchmarks/calibrate_consensus.py on the real scenes of the training set.
 _CONSENSUS = {True: (0.59, 2.60), False: (0.65, 2.25)}
@@ -56,7 +54,7 @@ def keep_by_target(
         (M,) bool. Pairs do not depend on each other, nor on the order of their matches.
 
     Raises:
-        ValueError: unless just one target is given.
+        ValueError: unless just one target is given, in [0, 1], or for a probability that is NaN.
 
     >>> probability = torch.tensor([0.9, 0.2, 0.8, 0.5])
     >>> keep_by_target(probability, probability > 0, torch.tensor([0, 4]), min_precision=0.7)
@@ -64,23 +62,29 @@ def keep_by_target(
     """
     if (target_sensitivity is None) == (min_precision is None):
         raise ValueError(f"give target_sensitivity or min_precision, got {target_sensitivity} and {min_precision}")
-    batch = ptr_to_batch(ptr)
+    name, target = next(
+        (name, value)
+        for name, value in (("target_sensitivity", target_sensitivity), ("min_precision", min_precision))
+        if value is not None
+    )
+    if not 0 <= target <= 1:
+        raise ValueError(f"{name} must lie in [0, 1], got {target}")
+    if not torch.compiler.is_compiling() and bool(probability.isnan().any()):
+        raise ValueError(f"probability must not be NaN, got NaN in row {int(probability.isnan().int().argmax())}")
+    row = torch.arange(len(tested), device=ptr.device)
+    batch = torch.bucketize(row, ptr[1:], right=True)
     likely = torch.where(tested, probability.double(), -1)
     order = likely.argsort(descending=True, stable=True)
     order = order[batch[order].argsort(stable=True)]  # pairs stay in place, the likeliest of each first
     value = likely[order]
-    risk = torch.where(tested[order], (1 - value) * _PARTS, 0).round().long()
+    risk = torch.where(tested[order], (1 - value) * _PARTS, 0).floor().long()
     so_far = torch.nn.functional.pad(risk.cumsum(0), (1, 0))
     begin, end = ptr[:-1][batch], ptr[1:][batch]
     wrong = so_far[1:] - so_far[begin]  # expected among the matches down to this one
-    if min_precision is None:
-        limit = (1 - target_sensitivity) * (so_far[end] - so_far[begin])  # type: ignore[operator]
-    else:
-        count = torch.arange(1, len(batch) + 1, device=batch.device) - begin
-        limit = (1 - min_precision) * _PARTS * count
-    is_last = torch.ones_like(tested)  # of equal ones
-    is_last[:-1] = (value.diff() != 0) | (batch.diff() != 0)
-    fulfils = tested[order] & is_last & (wrong <= limit)
+    whole = so_far[end] - so_far[begin] if min_precision is None else (row + 1 - begin) * _PARTS
+    after = torch.minimum(row + 1, end - 1)
+    is_last = (after == row) | (value[after] != value)  # of equal ones
+    fulfils = tested[order] & is_last & (wrong <= (1 - target) * whole.double())
     least = torch.full_like(ptr[:-1], torch.inf, dtype=torch.float64)
     least.scatter_reduce_(0, batch, torch.where(fulfils, value, torch.inf), "amin")
     return tested & (likely >= least[batch])

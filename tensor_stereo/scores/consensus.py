@@ -17,8 +17,10 @@ from torch.autograd import forward_ad
 
 from tensor_stereo import ops
 from tensor_stereo.configs import Backend, ConsensusConfig
-from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.types import Adjacency, Matches
+from tensor_stereo.graphs import MatchGraphs, check_match_graphs
+from tensor_stereo.types import Matches
+
+_MAX_ROUNDS = 1000
 
 
 def consensus_score(
@@ -27,7 +29,8 @@ def consensus_score(
     """How likely every match is right, by what its neighbours in both views believe.
 
     Args:
-        matches: B pairs. ``cost``, if given, is evidence: it is compared with the other costs of its pair.
+        matches: B pairs, coordinates in px: what is below 1 px is near. ``cost``, if given, is evidence: it is compared
+            with the other costs of its pair, and left out in pairs that have infinite ones.
         graphs: of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
         config: None means the defaults, for rectified pairs.
         backend: as in :func:`tensor_stereo.build_graphs`, but back ends may differ in the last digits.
@@ -52,7 +55,8 @@ def consensus_score(
         (tensor(True), tensor(True))
     """
     config = config or ConsensusConfig()
-    _check(matches, graphs)
+    _check_tangents(matches)
+    check_match_graphs(matches, graphs)
     check_consensus(config)
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
@@ -77,17 +81,13 @@ def consensus_score(
     return belief.to(matches.keypoints0.dtype)
 
 
-def _check(matches: Matches, graphs: MatchGraphs) -> None:
+def _check_tangents(matches: Matches) -> None:
     for name in ("keypoints0", "keypoints1", "cost"):
         values: Tensor | None = getattr(matches, name)
         if values is None or torch.compiler.is_compiling():
             continue
         if forward_ad.unpack_dual(values).tangent is not None:  # type: ignore[no-untyped-call]
             raise NotImplementedError(f"{name} carries a tangent, but the consensus score has no forward mode")
-    for name in ("adjacency0", "adjacency1"):
-        adjacency: Adjacency = getattr(graphs, name)
-        if adjacency.num_nodes != matches.num_matches:
-            raise ValueError(f"graphs.{name} must have {matches.num_matches} nodes, got {adjacency.num_nodes}")
 
 
 def check_consensus(config: ConsensusConfig) -> None:
@@ -95,20 +95,14 @@ def check_consensus(config: ConsensusConfig) -> None:
 
     >>> check_consensus(ConsensusConfig())
     """
-    positive = (
-        "tolerance_px",
-        "whole_tolerance_px",
-        "row_tolerance_px",
-        "whole_row_tolerance_px",
-        "slope",
-        "reach",
-        "doubt",
-    )
-    for name in positive:
-        value = getattr(config, name)
-        if not (value is None and name == "row_tolerance_px") and not 0 < value < math.inf:
-            raise ValueError(f"ConsensusConfig.{name} must be positive, got {value}")
-    if not 0 <= config.cost_weight < math.inf:
-        raise ValueError(f"ConsensusConfig.cost_weight must be at least 0, got {config.cost_weight}")
-    if config.num_rounds < 1:
-        raise ValueError(f"ConsensusConfig.num_rounds must be at least 1, got {config.num_rounds}")
+    for name, value in vars(config).items():
+        if name == "num_rounds":
+            if not (isinstance(value, int) and 1 <= value <= _MAX_ROUNDS):
+                raise ValueError(
+                    f"ConsensusConfig.num_rounds must be an integer from 1 to {_MAX_ROUNDS}, got {value!r}"
+                )
+        elif name == "row_tolerance_px" and value is None:
+            continue
+        elif not isinstance(value, int | float) or not (0 < value < math.inf or (value == 0 and name == "cost_weight")):
+            least = "at least 0" if name == "cost_weight" else "positive"
+            raise ValueError(f"ConsensusConfig.{name} must be {least} and finite, got {value!r}")

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.features import to_gray
-from tensor_stereo.graphs import MatchGraphs
+from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.types import Matches
 
 MAX_DISPARITIES = 256  # of one pair's search range
@@ -25,6 +25,7 @@ _NEAR_PX = 3  # disparities on either side of the match that are looked at one b
 _SAME_PX = 2  # a rival is farther from the match than that
 _NOISE_VARIANCE = 2.0  # grey levels squared; keeps windows without texture from deciding
 _NOWHERE = 20.0  # log SSD of a place outside of the image
+_TIE = 1e-3  # log SSDs that near are alike; rounding must not choose between them
 _MAX_LOG = 6.0  # log ratios of SSDs are cut there
 _LIKENESS_LEVELS, _LIKENESS_PX2 = 12.0, 40.0  # fall-off of the weights of pixels unlike the centre
 _ROWS_AT_ONCE = 192  # matches whose windows stay in the cache
@@ -35,14 +36,16 @@ NUM_VALUES = 2 * (_WHOLE * (2 * _NEAR_PX + 1 + 7) + 2 * _HALF + 1) + 2
 class ImageEvidence(NamedTuple):
     """What the images say about M matches.
 
+    Windows have 15 x 15 px: 5 x 5 and 11 x 11 boxes, pixels like the centre, and four halves of 11 x 11.
+
     Attributes:
         values: (M, :data:`NUM_VALUES`) float32. For the windows of view 0, then of view 1: log SSD at the 7 places
             around the match, less its minimum; log SSD and correlation at the match; by how much the best rival on the
             row is worse in both; share of rivals that are about as good or better; log distance of a better rival; log
             SSD of half windows, and by how much it is above its minimum; log variance and gradient. At last the
             difference of the grey levels, and how far the disparity lies outside of the search range.
-        curve0: (M, D) float32, log SSD of the window in view 0 along the row of view 1, less that of the match; column
-            k stands for disparity ``first + k`` px.
+        curve0: (M, D) float32, log SSD of the window in view 0 along the row of view 1, less that of the match, over
+            pixels like the centre, between -6 and 6; column k stands for disparity ``first + k`` px.
         curve1: (M, D) float32, the same for the window in view 1 along the row of view 0.
         first: (M,) float32 px.
         num_columns: (M,) int64 columns that the pair has; 0 without images.
@@ -71,7 +74,7 @@ def measure_images(
         One row per match, on the device of the keypoints; it does not depend on the other pairs. No gradient.
 
     Raises:
-        ValueError: if the numbers of images and pairs differ.
+        ValueError: if the numbers of images and pairs, or of matches and nodes, differ.
 
     Example:
         >>> from tensor_stereo.graphs import build_match_graphs
@@ -84,17 +87,19 @@ def measure_images(
     if not len(images0) == len(images1) == matches.num_pairs:
         counts = f"{len(images0)} and {len(images1)} for {matches.num_pairs} pairs"
         raise ValueError(f"images0 and images1 must hold one image per pair, got {counts}")
+    check_match_graphs(matches, graphs)
     ranges = search_ranges(matches, graphs)
     width = max((count for _, count in ranges), default=0)
     parts = [_empty(matches.keypoints0, width)]
-    for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
-        gray = [to_gray(images[b][None])[0, 0].float() for images in (images0, images1)]
-        for row in range(start, stop, _ROWS_AT_ONCE):
-            rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
-            points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
-            parts.append(_measure_both(gray, points, *ranges[b], width))
+    with torch.autocast(matches.keypoints0.device.type, enabled=False):
+        for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
+            gray = [to_gray(images[b][None])[0, 0].float() for images in (images0, images1)]
+            for row in range(start, stop, _ROWS_AT_ONCE):
+                rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
+                points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
+                parts.append(_measure_both(gray, points, *ranges[b], width))
     values, curve0, curve1 = (torch.cat(part) for part in zip(*parts, strict=True))
-    spread = torch.tensor(ranges, device=matches.ptr.device).reshape(-1, 2)
+    spread = torch.tensor(ranges, dtype=torch.int64, device=matches.ptr.device).reshape(-1, 2)
     first, count = spread.repeat_interleave(matches.ptr.diff(), 0).unbind(1)
     return ImageEvidence(values, curve0, curve1, first.float(), count)
 
@@ -103,7 +108,7 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
     """First disparity and number of disparities to search in each pair, in whole px.
 
     They cover what at least three neighbours on their rows support, in either view, but for 1 % at both ends, and 15 %
-    of that span on either side.
+    of that span on either side. Of wider spans the :data:`MAX_DISPARITIES` with the most matches are searched.
 
     >>> from tensor_stereo.graphs import build_match_graphs
     >>> points = torch.tensor([[9.0, 9.0], [20.0, 9.0], [9.0, 20.0]])
@@ -129,7 +134,13 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
         low, high = torch.quantile(believed, believed.new_tensor([0.01, 0.99])).tolist()
         margin = max(4.0, 0.15 * (high - low))
         first, last = math.floor(low - margin), math.ceil(high + margin)
-        ranges.append((max(first, last + 1 - MAX_DISPARITIES), min(last - first + 1, MAX_DISPARITIES)))
+        if last - first >= MAX_DISPARITIES:
+            ordered = believed.sort().values
+            begin = ordered.floor() - _NEAR_PX
+            within = torch.searchsorted(ordered, begin + MAX_DISPARITIES - _NEAR_PX) - torch.arange(len(ordered))
+            first = int(begin[within.argmax()])
+            last = first + MAX_DISPARITIES - 1
+        ranges.append((first, last - first + 1))
     return ranges
 
 
@@ -161,25 +172,32 @@ def _measure_one(
     """Values of the windows of one view, held against the image of the other, and their curve."""
     kernels = _window_kernels(windows)
     near = _sample(other, partners, _RADIUS_PX + _NEAR_PX)
-    cost, likeness, variance = _compare(windows, near if view else near.flip(2), kernels)
+    cost, likeness, variance = _compare(windows, near, kernels)
+    if not view:  # disparity grows against the columns of view 1
+        cost, likeness = cost.flip(1), likeness.flip(1)
     mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
     # the row of the window itself: there lies a rectified partner
     toward = 1 if view else -1  # way of growing disparity in the other view
     x = points[:, :1] + toward * (first + torch.arange(count, device=points.device))  # (m, D)
     left = x.amin(1) if count else points[:, 0]
     strip = _sample_strip(other, left - _RADIUS_PX, points[:, 1], count + 2 * _RADIUS_PX)
-    far, far_likeness, _ = _compare(windows, strip if view else strip.flip(2), kernels[..., :_WHOLE])
+    far, far_likeness, _ = _compare(windows, strip, kernels[..., :_WHOLE])
+    if not view:
+        far, far_likeness = far.flip(1), far_likeness.flip(1)
     outside = ((x < 0) | (x > other.shape[1] - 1))[..., None]
     far, far_likeness = far.masked_fill(outside, _NOWHERE), far_likeness.masked_fill(outside, -1.0)
     place = torch.arange(count, device=own.device)
     same = ((place - own[:, None]).abs() <= _SAME_PX)[..., None]
     alone = (same | outside).all(1)
-    rival, where = far.masked_fill(same, _NOWHERE).min(1)
+    others = far.masked_fill(same, _NOWHERE)
+    rival = others.amin(1)
+    away = (place - own[:, None]).abs()[..., None].expand_as(others)  # of equal rivals the nearest counts
+    nearest = away.masked_fill(others > rival[:, None] + _TIE, 100).amin(1)
     whole, whole_likeness = mid[:, :_WHOLE], likeness[:, _NEAR_PX, :_WHOLE]
     margin = (rival - whole).clamp(-_MAX_LOG, _MAX_LOG).masked_fill(alone, 0)
     margin_likeness = (whole_likeness - far_likeness.masked_fill(same, -1.0).amax(1)).masked_fill(alone, 0)
     crowd = (~same & (far < whole[:, None] + 0.3)).float().mean(1)
-    distance = torch.log1p((where - own[:, None]).abs().clamp(max=100)).masked_fill(margin >= 0, 0)
+    distance = torch.log1p(nearest.clamp(max=100)).masked_fill(margin >= -_TIE, 0)
     gradient = torch.log1p(windows.diff(dim=2)[:, 3:-3, 3:-3].square().mean((1, 2)))
     columns = [
         (cost - lowest[:, None])[..., :_WHOLE].flatten(1),

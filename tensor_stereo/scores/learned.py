@@ -23,6 +23,7 @@ from tensor_stereo.scores.quantities import (
     NUM_EDGE_IMAGE,
     NUM_NODE,
     Quantities,
+    check_fit,
     measure_quantities,
 )
 from tensor_stereo.types import Adjacency, Matches
@@ -84,8 +85,9 @@ class LearnedScore(nn.Module):
         Returns:
             (M,) float32 each. Gradients flow to the keypoints from all that is continuous in them, and are finite.
         """
-        logit, _ = self.infer(measure_quantities(matches, graphs, evidence))
-        return logit, self.calibrate(logit)
+        with torch.autocast(matches.keypoints0.device.type, enabled=False):
+            logit, _ = self.infer(measure_quantities(matches, graphs, evidence))
+            return logit, self.calibrate(logit)
 
     def infer(self, q: Quantities) -> tuple[Tensor, list[Tensor]]:
         """(M,) logits, and those after the start and each round but the last, which training looks at too."""
@@ -191,16 +193,17 @@ def load_learned(device: torch.device | None = None) -> LearnedScore:
         device: where it runs; None: the CPU.
 
     Returns:
-        One network per device, shared by all callers.
+        One network per device and process, shared by all callers.
 
     >>> load_learned().training
     False
     """
     from safetensors.torch import load_file
 
-    network = LearnedScore()
-    network.load_state_dict(load_file(WEIGHTS))
-    return network.requires_grad_(False).eval().to(device or torch.device("cpu"))
+    with torch.inference_mode(False):  # weights that were made in it could never take part in a gradient
+        network = LearnedScore().float()
+        network.load_state_dict(load_file(WEIGHTS))
+        return network.requires_grad_(False).eval().to(device or torch.device("cpu"))
 
 
 def score_learned(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None) -> Tensor:
@@ -215,6 +218,9 @@ def score_learned(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence
         (M,) float32 in (0, 1), higher is better. A match that is no vertex of the graphs (a duplicate) is scored from
         its own quantities. Gradients flow to the keypoints from all that is continuous in them, and are finite.
 
+    Raises:
+        ValueError: for graphs or evidence of another number of matches.
+
     Example:
         >>> from tensor_stereo.graphs import build_match_graphs
         >>> left = torch.rand(300, 2, generator=torch.Generator().manual_seed(0)) * 300
@@ -225,6 +231,7 @@ def score_learned(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence
         >>> bool(score[:30].max() < score[30:].median())
         True
     """
+    check_fit(matches, graphs, evidence)
     network = load_learned(matches.keypoints0.device)
     parts = [network(*part)[1] for part in _parts(matches, graphs, evidence)]
     return torch.cat(parts) if parts else matches.keypoints0.new_zeros(0, dtype=torch.float32)

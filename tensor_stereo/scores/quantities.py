@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
-from tensor_stereo.graphs import MatchGraphs
+from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.scores.evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.types import Adjacency, Matches
@@ -42,7 +42,7 @@ class Quantities(NamedTuple):
     image: Tensor  # (M, NUM_VALUES); zero without images
     has_cost: Tensor  # (M, 1) 0 or 1
     has_image: Tensor  # (M, 1) 0 or 1
-    disparity: Tensor  # (M,) px
+    disparity: Tensor  # (M,) px, less the mean of the pair
     batch: Tensor  # (M,) int64 pair of each match
     share: Tensor  # (M, 1) one over the number of matches of the pair
     degree: Tensor  # (M, 1) neighbours in either view, at least 1
@@ -71,6 +71,9 @@ def measure_quantities(matches: Matches, graphs: MatchGraphs, evidence: ImageEvi
         The quantities. Gradients flow from all that is continuous in the keypoints, and are finite; none through
         ``cost`` and ``evidence``.
 
+    Raises:
+        ValueError: for graphs or evidence of another number of matches.
+
     Example:
         >>> from tensor_stereo.graphs import build_match_graphs
         >>> points = torch.tensor([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])
@@ -78,31 +81,46 @@ def measure_quantities(matches: Matches, graphs: MatchGraphs, evidence: ImageEvi
         >>> measure_quantities(matches, build_match_graphs(matches)).edges.shape
         torch.Size([3, 14])
     """
+    check_fit(matches, graphs, evidence)
     batch = ptr_to_batch(matches.ptr)
-    share = (1 / matches.ptr.diff()).index_select(0, batch)[:, None]
-    points = _centered_points(matches, batch, share)
-    disparity = matches.disparity.float()
-    nodes, degree = _node_quantities((points[:, 1] - points[:, 3]).abs(), graphs)
-    present = nodes.new_ones(len(nodes), 1)
+    share = (1 / matches.ptr.diff().double()).index_select(0, batch)[:, None]
+    points = [_center(view, matches.num_pairs, batch, share) for view in (matches.keypoints0, matches.keypoints1)]
+    disparity = matches.keypoints0[:, :1].double() - matches.keypoints1[:, :1].double()
+    row_offset = (matches.keypoints0[:, 1].double() - matches.keypoints1[:, 1].double()).abs().float()
+    nodes, degree = _node_quantities(row_offset, graphs)
     if matches.cost is None:
-        cost, has_cost = nodes.new_zeros(len(nodes), NUM_COST), torch.zeros_like(present)
+        cost, has_cost = nodes.new_zeros(len(nodes), NUM_COST), nodes.new_zeros(len(nodes), 1)
     else:
-        cost, has_cost = _relative_cost(matches.cost.detach(), matches.ptr, batch), present
+        cost, has_cost = _relative_cost(matches.cost.detach().double(), matches.ptr, batch)
     i, j, in0, in1 = _union(graphs.adjacency0, graphs.adjacency1)
     receivers = find_receivers(i, j, len(nodes))
-    edges, step, length = _edge_quantities(points, i, j, in0, in1)
+    edges, step, length = _edge_quantities(torch.cat(points, 1), i, j, in0, in1)
     mean_length = (receivers.sum(length[:, None], length[:, None])[:, 0] / degree).clamp(min=1e-3)
     step = 2 * step / (mean_length.index_select(0, i) + mean_length.index_select(0, j))
     if evidence is None:
-        image, has_image = nodes.new_zeros(len(nodes), NUM_VALUES), torch.zeros_like(present)
+        image, has_image = nodes.new_zeros(len(nodes), NUM_VALUES), nodes.new_zeros(len(nodes), 1)
         image_i = image_j = edges.new_zeros(len(i), NUM_EDGE_IMAGE)
     else:
         image, has_image = evidence.values, (evidence.num_columns > 0)[:, None].float()
-        image_i, image_j = (_look_up(evidence, disparity.detach(), *ends) for ends in ((i, j), (j, i)))
+        image_i, image_j = (_look_up(evidence, disparity.detach()[:, 0], *ends) for ends in ((i, j), (j, i)))
+    centered = _center(disparity, matches.num_pairs, batch, share)[:, 0]
     return Quantities(
-        nodes, cost, image, has_cost, has_image, disparity, batch, share, degree[:, None],
+        nodes, cost, image, has_cost, has_image, centered, batch, share.float(), degree[:, None],
         i, j, edges, image_i, image_j, step.t(), receivers, matches.num_pairs,
     )  # fmt: skip
+
+
+def check_fit(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None) -> None:
+    """Raise unless graphs and evidence are as long as there are matches.
+
+    >>> from tensor_stereo.graphs import build_match_graphs
+    >>> points = torch.tensor([[0.0, 0.0], [4.0, 0.0]])
+    >>> matches = Matches(points, points, torch.tensor([0, 2]))
+    >>> check_fit(matches, build_match_graphs(matches), None)
+    """
+    check_match_graphs(matches, graphs)
+    if evidence is not None and len(evidence.values) != matches.num_matches:
+        raise ValueError(f"evidence must be that of {matches.num_matches} matches, got {len(evidence.values)}")
 
 
 def find_receivers(i: Tensor, j: Tensor, num_matches: int) -> Receivers:
@@ -119,12 +137,11 @@ def find_receivers(i: Tensor, j: Tensor, num_matches: int) -> Receivers:
     return Receivers(*found)
 
 
-def _centered_points(matches: Matches, batch: Tensor, share: Tensor) -> Tensor:
-    """(M, 4) float32 px x0, y0, x1, y1 from the mean of the pair in view 0; rounding does not grow with a shift."""
-    points = torch.cat([matches.keypoints0, matches.keypoints1], 1)
-    with torch.no_grad():
-        mean = points.new_zeros(matches.num_pairs, 2).index_add(0, batch, matches.keypoints0 * share)
-    return (points - mean.repeat(1, 2).index_select(0, batch)).float()
+def _center(values: Tensor, num_pairs: int, batch: Tensor, share: Tensor) -> Tensor:
+    """(M, K) float32, less the mean of the pair, so that rounding does not grow with a shift."""
+    values = values.double()
+    mean = values.new_zeros(num_pairs, values.shape[1]).index_add(0, batch, values.detach() * share)
+    return (values - mean.index_select(0, batch)).float()
 
 
 def _node_quantities(row_offset: Tensor, graphs: MatchGraphs) -> tuple[Tensor, Tensor]:
@@ -143,9 +160,13 @@ def _node_quantities(row_offset: Tensor, graphs: MatchGraphs) -> tuple[Tensor, T
     return torch.stack(columns, 1), degree
 
 
-def _relative_cost(cost: Tensor, ptr: Tensor, batch: Tensor) -> Tensor:
-    """(M, 2) rank of the cost within its pair, in (0, 1), equal costs alike; and its logarithm over the pair's mean."""
-    cost = cost.double()
+def _relative_cost(cost: Tensor, ptr: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, 2) rank of the cost within its pair, in (0, 1), equal costs alike, and its logarithm over the pair's mean.
+
+    (M, 1) float32, 0 in pairs with infinite costs, which say nothing. Costs of a pair with negative ones count from the
+    least.
+    """
+    lengths = ptr.diff()
     order = torch.argsort(cost)
     order = order[torch.argsort(batch[order], stable=True)]
     ordered, pair = cost[order], batch[order]
@@ -156,11 +177,14 @@ def _relative_cost(cost: Tensor, ptr: Tensor, batch: Tensor) -> Tensor:
     total = place.new_zeros(len(order)).index_add(0, run, place)
     middle = torch.empty_like(place)
     middle[order] = (total / torch.bincount(run, minlength=len(order)).clamp(min=1))[run]
-    lengths = ptr.diff()
     rank = (middle - ptr[batch] + 0.5) / lengths[batch]
-    logs = torch.log(cost.clamp(min=0) + 1e-3)
+    usable = cost.new_ones(len(lengths)).scatter_reduce(0, batch, cost.isfinite().to(cost), "amin")[batch]
+    cost = torch.where(usable > 0, cost, 0)
+    least = cost.new_zeros(len(lengths)).scatter_reduce(0, batch, cost, "amin")
+    logs = torch.log(cost - least[batch] + 1e-3)
     mean = logs.new_zeros(len(lengths)).index_add(0, batch, logs) / lengths.clamp(min=1)
-    return torch.stack([rank, (logs - mean[batch]).clamp(-5, 5)], 1).float()
+    columns = torch.stack([rank, (logs - mean[batch]).clamp(-5, 5)], 1)
+    return columns.float(), usable[:, None].float()
 
 
 def _union(adjacency0: Adjacency, adjacency1: Adjacency) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -214,8 +238,8 @@ def _look_up(evidence: ImageEvidence, disparity: Tensor, i: Tensor, j: Tensor) -
     """(U, 3) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
     width = evidence.curve0.shape[1]
     if not width:
-        return disparity.new_zeros(len(i), NUM_EDGE_IMAGE)
-    other = disparity.index_select(0, j)
+        return evidence.values.new_zeros(len(i), NUM_EDGE_IMAGE)
+    other = disparity.index_select(0, j)  # float64
     column = (other - evidence.first.index_select(0, i)).round().long()
     known = (column >= 0) & (column < evidence.num_columns.index_select(0, i))
     place = torch.where(known, column, 0) + i * width

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 
 import pytest
 import torch
@@ -94,13 +95,20 @@ def test_what_does_not_fit_is_refused() -> None:
     graphs = build_match_graphs(matches)
     with pytest.raises(ValueError, match="adjacency0 must have 30 nodes, got 12"):
         consensus_score(matches, build_match_graphs(_matches(3, 12)))
-    for name in ("tolerance_px", "row_tolerance_px", "slope", "reach", "doubt"):
-        with pytest.raises(ValueError, match=f"ConsensusConfig.{name} must be positive, got 0"):
-            consensus_score(matches, graphs, ConsensusConfig(**{name: 0}))
-    with pytest.raises(ValueError, match="cost_weight"):
+    with pytest.raises(ValueError, match="adjacency1 must have 30 nodes, got 12"):
+        consensus_score(matches, graphs._replace(adjacency1=build_match_graphs(_matches(3, 12)).adjacency1))
+    names = [field.name for field in dataclasses.fields(ConsensusConfig)]
+    for name in names[:-2]:
+        for wrong in (0, -1.0, math.nan, math.inf, "1"):
+            with pytest.raises(ValueError, match=f"ConsensusConfig.{name} must be positive and finite, got"):
+                consensus_score(matches, graphs, ConsensusConfig(**{name: wrong}))
+    with pytest.raises(ValueError, match="whole_row_tolerance_px"):
+        consensus_score(matches, graphs, ConsensusConfig(row_tolerance_px=None, whole_row_tolerance_px=None))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="cost_weight must be at least 0"):
         consensus_score(matches, graphs, ConsensusConfig(cost_weight=-1))
-    with pytest.raises(ValueError, match="num_rounds"):
-        consensus_score(matches, graphs, ConsensusConfig(num_rounds=0))
+    for rounds in (0, 1.5, 2**33):
+        with pytest.raises(ValueError, match="num_rounds must be an integer from 1 to 1000"):
+            consensus_score(matches, graphs, ConsensusConfig(num_rounds=rounds))  # type: ignore[arg-type]
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # torch's own forward mode
@@ -129,7 +137,7 @@ def test_costs_of_any_sign_are_evidence_and_infinite_ones_are_none(backend: str)
     alone[1] = dataclasses.replace(alone[1], cost=alone[0].cost - alone[0].cost.min())
     torch.testing.assert_close(_score(alone[0], backend), _score(alone[1], backend), rtol=0, atol=1e-12)
     endless = matches.cost.clone()
-    endless[[3, 30]] = torch.inf
+    endless[[3, 30]] = torch.tensor([torch.inf, 1.7e308], dtype=endless.dtype)
     found = _score(dataclasses.replace(matches, cost=endless), backend, cost_weight=0.5)
-    order = dataclasses.replace(matches, cost=endless.isfinite().logical_not().double())  # the same duplicates
+    order = dataclasses.replace(matches, cost=(endless > 1e300).double())  # the same duplicates
     torch.testing.assert_close(found, _score(order, backend, cost_weight=0.0), rtol=0, atol=1e-12)

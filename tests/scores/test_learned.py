@@ -15,11 +15,11 @@ from tensor_stereo.datasets import render_pair
 from tensor_stereo.features import to_gray
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.pipeline import Stopwatch, match_pairs
-from tensor_stereo.scores.evidence import ImageEvidence, measure_images
+from tensor_stereo.scores.evidence import MAX_DISPARITIES, NUM_VALUES, ImageEvidence, measure_images, search_ranges
 from tensor_stereo.scores.learned import load_learned, score_learned
 from tensor_stereo.types import Matches, StereoPair
 
-ROUNDING = 2e-3  # of a logit
+ROUNDING = 1e-3  # of a logit, of log SSDs; sums of float32 in another order
 
 
 @cache
@@ -150,3 +150,100 @@ def test_number_of_images_must_fit() -> None:
     _, matches = rendered(0)
     with pytest.raises(ValueError, match="one image per pair, got 0 and 0 for 1"):
         measure_images([], [], matches, build_match_graphs(matches))
+
+
+def test_mirrored_views_change_places() -> None:
+    """Seen in a mirror the right view is the left one; evidence that tells them apart would be wrong in one of them."""
+    pair, matches = rendered(1)
+    width = pair.image0.shape[2]
+
+    def mirror(points: Tensor) -> Tensor:
+        return torch.stack([width - 1 - points[:, 0], points[:, 1]], 1)
+
+    twin = Matches(mirror(matches.keypoints1), mirror(matches.keypoints0), matches.ptr, matches.cost)
+    turned = replace(pair, image0=pair.image1.flip(2), image1=pair.image0.flip(2))
+    found, expected = evidence_of(twin, turned), evidence_of(matches, pair)
+    torch.testing.assert_close(found.curve0, expected.curve1, rtol=0, atol=ROUNDING)
+    torch.testing.assert_close(found.curve1, expected.curve0, rtol=0, atol=ROUNDING)
+    size = (NUM_VALUES - 2) // 2  # of one view; there the left and the right half windows change places
+    halves = [39, 40, 43, 44]
+    rest = [k for k in range(size) if k not in halves]
+    own, other = (values.values[:, : 2 * size].reshape(-1, 2, size) for values in (found, expected))
+    torch.testing.assert_close(own[..., rest], other.flip(1)[..., rest], rtol=0, atol=ROUNDING)
+    swapped = other.flip(1)[..., [40, 39, 44, 43]]
+    torch.testing.assert_close(own[..., halves], swapped, rtol=0, atol=ROUNDING)
+
+
+def test_equal_rivals_do_not_hang_on_rounding() -> None:
+    """Under a pattern that repeats exactly, many places are equally good."""
+    y, x = torch.meshgrid(torch.arange(80), torch.arange(160), indexing="ij")
+    pattern = (((x // 4) + (y // 4)) % 2 * 200).to(torch.uint8)[None]
+    rng = torch.Generator().manual_seed(0)
+    left = torch.rand(60, 2, generator=rng, dtype=torch.float64) * torch.tensor([80.0, 50.0]) + torch.tensor(
+        [60.0, 15.0]
+    )
+    matches = Matches(left, left - torch.tensor([20.0, 0.0]), torch.tensor([0, 60]), torch.rand(60, generator=rng))
+    pair = StereoPair("pattern", pattern, pattern.roll(-20, 2))
+    order = torch.randperm(60, generator=rng)
+    shuffled = reorder(matches, order)
+    assert_same(logits(shuffled, evidence_of(shuffled, pair)), logits(matches, evidence_of(matches, pair))[order])
+
+
+def test_wide_ranges_are_searched_where_most_matches_are() -> None:
+    rng = torch.Generator().manual_seed(0)
+    left = torch.rand(300, 2, generator=rng, dtype=torch.float64) * 1000
+    disparity = torch.where(left[:, 0] < 300, 700, 40 + 0.1 * left[:, 0])
+    right = left - torch.stack([disparity, torch.zeros(300)], 1)
+    matches = Matches(left, right, torch.tensor([0, 300]))
+    ((first, count),) = search_ranges(matches, build_match_graphs(matches))
+    assert count == MAX_DISPARITIES
+    assert first <= 70
+    assert first + count > 140
+
+
+def test_costs_of_any_sign_are_evidence_and_infinite_ones_are_none() -> None:
+    _, matches = rendered(0)
+    assert_same(
+        logits(replace(matches, cost=matches.cost - 1e6)),
+        logits(replace(matches, cost=matches.cost - matches.cost.min())),
+    )
+    endless = matches.cost.clone()
+    endless[3] = torch.inf
+    assert_same(logits(replace(matches, cost=endless)), logits(replace(matches, cost=None)))
+
+
+def test_modes_of_torch_change_nothing() -> None:
+    pair, matches = rendered(0)
+    expected, evidence = logits(matches), evidence_of(matches, pair)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(logits(matches), expected)
+        for found, wanted in zip(evidence_of(matches, pair), evidence, strict=True):
+            assert torch.equal(found, wanted)
+    load_learned.cache_clear()
+    with torch.inference_mode():
+        assert torch.equal(logits(matches), expected)
+    leaf = matches.keypoints1.clone().requires_grad_()  # the network of the inference mode takes part in gradients
+    score_learned(replace(matches, keypoints1=leaf), build_match_graphs(matches)).sum().backward()
+    assert leaf.grad.abs().sum() > 0
+    torch.set_default_dtype(torch.float64)
+    try:
+        load_learned.cache_clear()
+        assert torch.equal(logits(matches), expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_graphs_and_evidence_of_other_matches_are_refused() -> None:
+    pair, matches = rendered(0)
+    few = replace(
+        matches,
+        **{n: getattr(matches, n)[:50] for n in ("keypoints0", "keypoints1", "cost")},
+        ptr=torch.tensor([0, 50]),
+    )
+    graphs = build_match_graphs(few)
+    with pytest.raises(ValueError, match=r"graphs\.adjacency0 must have"):
+        score_learned(matches, graphs)
+    with pytest.raises(ValueError, match=r"graphs\.adjacency0 must have"):
+        measure_images([pair.image0], [pair.image1], matches, graphs)
+    with pytest.raises(ValueError, match="evidence must be that of 50 matches"):
+        score_learned(few, graphs, evidence_of(matches, pair))

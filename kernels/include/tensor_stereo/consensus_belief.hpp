@@ -16,7 +16,7 @@ struct ConsensusMatches {
     const std::int64_t* cols[2];  // rows of the neighbours
 };
 
-// See tensor_stereo.scores.consensus.ConsensusConfig.
+// See tensor_stereo.configs.ConsensusConfig.
 struct ConsensusSettings {
     double tolerance, whole_tolerance;
     std::optional<double> row_tolerance;

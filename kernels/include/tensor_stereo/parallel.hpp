@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <exception>
 #include <mutex>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -35,7 +36,10 @@ void parallel_for(std::int64_t count, std::int64_t grain, int num_threads, const
     };
     const auto helpers = std::min<std::int64_t>(num_threads, (count + grain - 1) / grain) - 1;
     std::vector<std::thread> threads;
-    for (std::int64_t k = 0; k < helpers; ++k) threads.emplace_back(run);
+    try {
+        for (std::int64_t k = 0; k < helpers; ++k) threads.emplace_back(run);
+    } catch (const std::system_error&) {  // no more threads to be had: those that run do the work
+    }
     run();
     for (auto& thread : threads) thread.join();
     if (error) std::rethrow_exception(error);

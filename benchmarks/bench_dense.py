@@ -137,13 +137,22 @@ def try_thresholds(cases: list[Case]) -> Tried:
 
 
 def choose_thresholds(tried: list[Tried], scenes: Rows) -> list[dict[str, float]]:
-    """The thresholds with the least mean bad-2px: one for each kind of matches, of a probability one for all kinds."""
-    mean = np.mean([of_kind["learned"][1][scenes].mean(0) for of_kind in tried], 0)
-    shared = {"learned": float(PROBABILITIES[mean.argmin()])}
+    """A threshold of each score: one for each kind of matches, of a probability one for all kinds."""
+    mean = np.mean([of_kind["learned"][1][scenes] for of_kind in tried], 0)
+    shared = {"learned": middle_threshold(PROBABILITIES, mean)}
     return [
-        {name: float(t[bad[scenes].mean(0).argmin()]) for name, (t, bad) in of_kind.items()} | shared
-        for of_kind in tried
+        {name: middle_threshold(t, bad[scenes]) for name, (t, bad) in of_kind.items()} | shared for of_kind in tried
     ]
+
+
+def middle_threshold(thresholds: np.ndarray, bad: np.ndarray) -> float:
+    """Of the (T,) thresholds that are at most one standard error worse than the best on (S, T), the middle one.
+
+    The rule of one standard error (Breiman et al. 1984, section 3.4.3): the least mean of a flat curve is an accident.
+    """
+    worse = bad - bad[:, [bad.mean(0).argmin()]]
+    alike = thresholds[worse.mean(0) <= worse.std(0, ddof=1) / np.sqrt(len(bad))]
+    return float(alike[len(alike) // 2])
 
 
 def keep(scores: Scored, name: str, thresholds: dict[str, float]) -> Rows:

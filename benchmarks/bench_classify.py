@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import torch
-from harness import Suite, matched_points
+from harness import Suite, matched_batch, matched_points
 from scipy.spatial import Delaunay
 
 import tensor_stereo as ts
@@ -30,8 +29,7 @@ def main() -> None:
     suite = Suite("classify")
     for kind in ("float", "integer"):
         pairs = [matched_points(kind, COUNT, 10 * b) for b in range(PAIRS)]
-        left, right = (torch.from_numpy(np.concatenate(view)) for view in zip(*pairs, strict=True))
-        matches = ts.Matches(left, right, torch.arange(PAIRS + 1) * COUNT)
+        matches = matched_batch(kind, PAIRS, COUNT)
         keypoints = [[[cv2.KeyPoint(float(x), float(y), 1) for x, y in view] for view in pair] for pair in pairs]
         links = [cv2.DMatch(i, i, 0.0) for i in range(COUNT)]
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from harness import Suite, matched_points
+from harness import Suite, matched_batch
 
-import tensor_stereo as ts
 from tensor_stereo.filters import classify_graphs
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.ops import row_overlap
@@ -15,9 +13,7 @@ from tensor_stereo.ops import row_overlap
 def main() -> None:
     suite = Suite("relations")
     for kind in ("float", "integer"):
-        pairs = [matched_points(kind, 1000, 10 * b) for b in range(64)]
-        left, right = (torch.from_numpy(np.concatenate(view)) for view in zip(*pairs, strict=True))
-        matches = ts.Matches(left, right, torch.arange(65) * 1000)
+        matches = matched_batch(kind, 64, 1000)
         graphs = build_match_graphs(matches)
         a0, a1 = (graph.to_sparse_csr(torch.int8) for graph in (graphs.adjacency0, graphs.adjacency1))
         rows = [(a.crow_indices, a.col_indices) for a in (graphs.adjacency0, graphs.adjacency1)]

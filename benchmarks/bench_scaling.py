@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import torch
-from harness import Suite, matched_points, points
+from harness import Suite, matched_batch, points
 
 import tensor_stereo as ts
 from tensor_stereo.ops import delaunay_graph
@@ -30,12 +30,6 @@ print((peak() - before) / (left.nbytes + right.nbytes))
 """
 
 
-def batch(kind: str, pairs: int, count: int) -> ts.Matches:
-    views = zip(*(matched_points(kind, count, 10 * b) for b in range(pairs)), strict=True)
-    left, right = (torch.from_numpy(np.concatenate(view)) for view in views)
-    return ts.Matches(left, right, torch.arange(pairs + 1) * count)
-
-
 def main() -> None:
     suite = Suite("scaling")
     for kind in ("float", "integer"):
@@ -46,13 +40,13 @@ def main() -> None:
             "1 segment of 100000": lambda s=sizes[100_000]: delaunay_graph(*s, None, 1e-3, "native"),
         }
         suite.compare(f"growth with N, {kind}", cases, units=100_000, repeats=9)
-        few, lots = batch(kind, 16, 300), batch(kind, 1024, 300)
+        few, lots = matched_batch(kind, 16, 300), matched_batch(kind, 1024, 300)
         cases = {
             "16 segments x 64": lambda m=few: [ts.classify_matches(m) for _ in range(64)],
             "1024 segments": lambda m=lots: ts.classify_matches(m),
         }
         suite.compare(f"growth with segments of 300, {kind}", cases, units=1024, repeats=9)
-        half = batch(kind, 128, 1000)
+        half = matched_batch(kind, 128, 1000)
 
         def on(threads: int, matches: ts.Matches = half) -> None:
             torch.set_num_threads(threads)

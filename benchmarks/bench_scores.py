@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from harness import Suite, matched_points
+from harness import Suite, matched_batch
 
 import tensor_stereo as ts
 from tensor_stereo.graphs import build_match_graphs
@@ -22,9 +21,7 @@ def plain_consensus(matches: ts.Matches) -> torch.Tensor:
 def main() -> None:
     suite = Suite("scores")
     for kind in ("float", "integer"):
-        pairs = [matched_points(kind, COUNT, 10 * b) for b in range(PAIRS)]
-        left, right = (torch.from_numpy(np.concatenate(view)) for view in zip(*pairs, strict=True))
-        matches = ts.Matches(left, right, torch.arange(PAIRS + 1) * COUNT)
+        matches = matched_batch(kind, PAIRS, COUNT)
         filters = {name: ts.DelaunayFilter(score=name) for name in ("topology", "consensus", "learned")}
         cases = {"classify_matches": lambda m=matches: ts.classify_matches(m)}
         cases |= {name: lambda m=matches, f=f: f(m) for name, f in filters.items()}

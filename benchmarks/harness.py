@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import tensor_stereo as ts
+
 RESULTS = Path(__file__).parent / "results"
 PACKAGES = ("tensor-stereo", "torch", "numpy", "scipy", "kornia", "opencv-contrib-python-headless", "shull")
 
@@ -138,3 +140,10 @@ def matched_points(kind: str, count: int, seed: int = 0, wrong: float = 0.3) -> 
     bad = rng.random(count) < wrong
     right[bad] = points(kind, count, seed + 1)[bad]
     return left, right
+
+
+def matched_batch(kind: str, pairs: int, count: int) -> ts.Matches:
+    """``pairs`` pairs of :func:`matched_points`, always the same ones."""
+    views = zip(*(matched_points(kind, count, 10 * b) for b in range(pairs)), strict=True)
+    left, right = (torch.from_numpy(np.concatenate(view)) for view in views)
+    return ts.Matches(left, right, torch.arange(pairs + 1) * count)

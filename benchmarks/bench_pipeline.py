@@ -48,10 +48,10 @@ def main() -> None:
         source, pairs = "eight scenes", [PairDataset(files)[k] for k in range(len(files))]
     tensors = [(to_gray(p.image0[None])[0], to_gray(p.image1[None])[0]) for p in pairs]
     arrays = [(a[0].numpy(), b[0].numpy()) for a, b in tensors]
-    config = PipelineConfig(detector="fast", matching=GATES)
+    config = PipelineConfig(detector="fast", matching=GATES, score="none")
     cases = {
         "tensor_stereo, gated": lambda: run_pipeline(tensors, config),
-        "tensor_stereo, no gates": lambda: run_pipeline(tensors, PipelineConfig(detector="fast")),
+        "tensor_stereo, no gates": lambda: run_pipeline(tensors, PipelineConfig(detector="fast", score="none")),
         "OpenCV + NumPy + scipy + sets": lambda: naive(arrays),
     }
     cv2.setNumThreads(2)

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.configs import ConsensusConfig
+from tensor_stereo.batching import lengths_to_ptr, select_matches
+from tensor_stereo.duplicates import coincident_ids, first_of_coincident
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.modules import DelaunayFilter
+from tensor_stereo.ops.segments import pair_of, to_points
 from tensor_stereo.types import Matches
 
 
@@ -19,8 +20,8 @@ class FilteredDisparity(NamedTuple):
     """Verdicts on the grid of B disparity maps; H' = ceil(H / stride), W' = ceil(W / stride).
 
     Attributes:
-        inlier: (B, 1, H', W') bool; False where there is no match.
-        score: (B, 1, H', W') in [0, 1], higher is better; 0 where there is no match.
+        inlier: (B, 1, H', W') bool; False where there is no match, or a hidden one.
+        score: (B, 1, H', W') in [0, 1], higher is better; 0 where there is no match, or a hidden one.
         mask: (B, 1, H', W') bool, grid points that are matches: known, not masked out, and inside view 1.
         grid: (H', W', 2) their (x, y) in px of view 0.
     """
@@ -42,25 +43,26 @@ def filter_disparity(
 
     The point (x, y) and its disparity d are the match (x, y) -> (x - d, y). The result stays on the grid, because the
     pixels between were not looked at; it belongs to ``disparity[..., ::stride, ::stride]``. Points that meet in view 1
-    at the same place hide each other: the largest disparity, which is the nearest surface, is taken and the others are
-    no inliers. A region that is wrong as a whole, shifted by one constant, looks like an object and is kept inside.
+    at the same place hide each other: the filter sees the one of the largest disparity, which is the nearest surface,
+    and the others are no inliers. A region that is wrong as a whole, shifted by one constant, looks like an object and
+    is kept inside.
 
     Args:
         disparity: (B, 1, H, W) float32 or float64, x0 - x1 in px, of any sign. NaN and infinite values are no matches,
             nor are those whose partner lies outside columns 0..W - 1.
         stride: distance of the grid's points in px, at least 1. The grid starts at pixel (0, 0).
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter()`` whose
-            consensus does not weigh the cost, which is less for nearer pixels so that they win where two meet.
+        filter: takes the matches that are not hidden, as Matches without cost, and returns a FilterOutput; None is
+            ``DelaunayFilter()``.
         mask: (B, 1, H, W) bool; where it is False, disparities are no matches. None means all.
 
     Returns:
         Verdicts on the grid, each map by itself. If the filter's score is differentiable, gradients flow from it to the
-        disparities of the matches; they are 0 elsewhere.
+        disparities of the matches that it sees; they are 0 elsewhere.
 
     Raises:
         ValueError: if shapes are others, ``stride`` is below 1, or a partner's column is below 1e-60 px without being 0
             (float64 only).
-        TypeError: if ``disparity`` is neither float32 nor float64, or ``mask`` is not bool.
+        TypeError: if ``disparity`` is no tensor of float32 or float64, ``mask`` none of bool, or ``stride`` no integer.
 
     Example:
         >>> disparity = torch.full((1, 1, 32, 32), 3.0)
@@ -71,6 +73,8 @@ def filter_disparity(
                 [False,  True,  True,  True],
                 [False,  True,  True,  True]])
     """
+    if not torch.is_tensor(disparity):
+        raise TypeError(f"disparity must be a tensor, got {type(disparity).__name__}")
     if disparity.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"disparity must be float32 or float64, got {disparity.dtype}")
     if disparity.ndim != 4 or disparity.shape[1] != 1:
@@ -79,6 +83,8 @@ def filter_disparity(
         raise TypeError(f"stride must be an integer number of px, got {stride!r}")
     if stride < 1:
         raise ValueError(f"stride must be at least 1 px, got {stride}")
+    if mask is not None and not torch.is_tensor(mask):
+        raise TypeError(f"mask must be a tensor, got {type(mask).__name__}")
     if mask is not None and mask.dtype != torch.bool:
         raise TypeError(f"mask must be bool, got {mask.dtype}")
     if mask is not None and mask.shape != disparity.shape:
@@ -96,10 +102,16 @@ def filter_disparity(
     values = sampled[found]  # (M,)
     keypoints0 = grid.expand(*found.shape, 2)[found]
     keypoints1 = torch.stack([keypoints0[:, 0] - values, keypoints0[:, 1]], dim=1)
-    ptr = lengths_to_ptr(found.sum((1, 2)))
-    # the cost says which of two pixels at one partner counts, and nothing of right and wrong
-    classify = filter or DelaunayFilter(consensus=ConsensusConfig(cost_weight=0.0))
-    output = classify(Matches(keypoints0, keypoints1, ptr, -values.detach()))
-    inlier = torch.zeros_like(found).masked_scatter(found, output.inlier)
-    score = torch.zeros_like(found, dtype=output.score.dtype).masked_scatter(found, output.score)
+    matches = Matches(keypoints0, keypoints1, lengths_to_ptr(found.sum((1, 2))))
+    nearest = _nearest_at_each_partner(matches)
+    output = (DelaunayFilter() if filter is None else filter)(select_matches(matches, nearest))
+    seen = torch.zeros_like(found).masked_scatter(found, nearest)
+    inlier = torch.zeros_like(found).masked_scatter(seen, output.inlier)
+    score = torch.zeros_like(found, dtype=output.score.dtype).masked_scatter(seen, output.score)
     return FilteredDisparity(inlier[:, None], score[:, None], found[:, None], grid)
+
+
+def _nearest_at_each_partner(matches: Matches) -> Tensor:
+    """(M,) bool, the largest disparity at every place of view 1: the last one, as each row is listed from the left."""
+    ids = coincident_ids(to_points("keypoints1", matches.keypoints1, matches.ptr), pair_of(matches.ptr))
+    return torch.from_numpy(first_of_coincident(ids[::-1])[::-1].copy()).to(matches.keypoints0.device)

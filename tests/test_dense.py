@@ -105,26 +105,75 @@ def test_verdicts_are_those_of_the_filter_on_the_listed_matches() -> None:
     assert torch.equal(result.score[result.mask], expected.score)
 
 
-def test_of_points_that_meet_in_view_1_the_nearest_surface_is_seen() -> None:
-    disparity = plane(0, 0, 4)
+def wall(height: int = 60) -> Tensor:
+    """A near wall before a far one, with noise in steps of 1/4 px; many points meet in view 1."""
+    disparity = plane(0, 0, 4, height)
     disparity[..., 40:60] = 20  # its partners are columns 20..39, where the background's 24..43 lie too
-    result = filter_disparity(disparity, 4)
-    x = result.grid[..., 0]
-    hidden = (x >= 24) & (x < 40)
-    assert not bool(result.inlier[0, 0][hidden].any())
-    inside = (x >= 44) & (x < 56)
-    assert bool(result.inlier[0, 0][inside].all())
+    noise = torch.randint(-6, 7, disparity.shape, generator=torch.Generator().manual_seed(0))
+    return disparity + torch.where(noise.abs() < 4, 0, noise) / 4
 
 
-def test_gradients_flow_to_the_disparities_of_matches_only() -> None:
-    disparity = plane(0.05, 0, 4)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_of_points_that_meet_in_view_1_the_nearest_surface_is_seen(sign: int) -> None:
+    given = []
+
+    def listening(matches: Matches) -> FilterOutput:
+        given.append(matches)
+        return DelaunayFilter()(matches)
+
+    disparity = torch.cat([wall(), wall().flip(2)]) - (0 if sign > 0 else 30)
+    result = filter_disparity(disparity, 4, filter=listening)
+    seen = torch.zeros_like(result.mask)
+    expected = []
+    for b in range(2):
+        nearest: dict[tuple[float, float], tuple[float, int, int]] = {}
+        for row, column in result.mask[b, 0].nonzero().tolist():
+            d = disparity[b, 0, 4 * row, 4 * column].item()
+            place = (4 * row, 4 * column - d)
+            nearest[place] = max(nearest.get(place, (-torch.inf, 0, 0)), (d, row, column))
+        for _, row, column in nearest.values():
+            seen[b, 0, row, column] = True
+        expected.append(len(nearest))
+    assert int(seen.sum()) < int(result.mask.sum()) - 20
+    assert given[0].ptr.diff().tolist() == expected
+    assert given[0].cost is None
+    assert torch.equal(given[0].keypoints0, result.grid.expand(2, *result.grid.shape)[seen[:, 0]])
+    plain = DelaunayFilter()(given[0])
+    for name in ("inlier", "score"):
+        values = getattr(result, name)
+        assert torch.equal(values[seen], getattr(plain, name)), name
+        assert not bool(values[~seen].any()), name
+    assert 0 < int(result.inlier.sum()) < int(seen.sum())
+
+
+def test_no_filter_is_the_default_filter() -> None:
+    one, other = (filter_disparity(wall(), 4, filter=given) for given in (None, DelaunayFilter()))
+    assert torch.equal(one.inlier, other.inlier)
+    assert torch.equal(one.score, other.score)
+
+
+@given(st.integers(-18, 24))
+def test_depth_as_such_is_no_evidence(shift: int) -> None:
+    disparity = wall()
+    x = torch.arange(90)
+    stays = ((x - disparity - max(shift, 0) >= 0) & (x - disparity - min(shift, 0) <= 89)).expand_as(disparity)
+    one, other = (filter_disparity(given, 4, mask=stays) for given in (disparity, disparity + shift))
+    assert int(one.mask.sum()) > 100
+    assert torch.equal(one.mask, other.mask)
+    assert torch.equal(one.inlier, other.inlier)
+    torch.testing.assert_close(one.score, other.score, rtol=0, atol=1e-9)
+
+
+def test_gradients_flow_to_the_disparities_of_seen_matches_only() -> None:
+    disparity = wall()
     disparity[0, 0, 0, 8] = torch.nan
     disparity.requires_grad_()
     result = filter_disparity(disparity, 4, filter=smooth_filter)
     result.score.sum().backward()
     assert disparity.grad is not None
     expected = torch.zeros_like(disparity, dtype=torch.bool)
-    expected[..., ::4, ::4] = result.mask
+    expected[..., ::4, ::4] = result.score > 0
+    assert 0 < int(expected.sum()) < int(result.mask.sum())
     assert torch.equal(disparity.grad != 0, expected)
     assert bool(torch.isfinite(disparity.grad).all())
 
@@ -149,6 +198,12 @@ def test_bad_arguments_are_named() -> None:
         filter_disparity(disparity.half(), 4)
     with pytest.raises(ValueError, match="stride must be at least 1"):
         filter_disparity(disparity, 0)
+    with pytest.raises(TypeError, match="disparity must be a tensor, got ndarray"):
+        filter_disparity(disparity.numpy(), 4)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"stride must be an integer number of px, got 4\.0"):
+        filter_disparity(disparity, 4.0)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="mask must be a tensor, got ndarray"):
+        filter_disparity(disparity, 4, mask=(disparity > 0).numpy())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="mask must be bool"):
         filter_disparity(disparity, 4, mask=disparity)
     with pytest.raises(ValueError, match="mask must have the shape"):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import LinearNDInterpolator
 from torch import Tensor
 
-from tensor_stereo import Matches
+from tensor_stereo import Matches, interpolation
 from tensor_stereo.batching import collate_matches, split_matches
 from tensor_stereo.interpolation import interpolate_disparity
 
@@ -108,6 +110,35 @@ def _nearest_on_hull(points: np.ndarray, values: np.ndarray, where: np.ndarray) 
     return outside, expected
 
 
+@pytest.mark.parametrize("kind", ["ellipse", "path"])
+@given(st.integers(2, 90), st.integers(0, 10**6), st.floats(0, 2 * math.pi))
+def test_hulls_of_many_sides_give_the_value_of_the_nearest_one(kind: str, count: int, seed: int, angle: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    width, height = (2 + 14 * torch.rand(2, generator=generator, dtype=torch.float64)).tolist()
+    if kind == "ellipse":
+        turn = torch.arange(count).double() * (2 * math.pi / count) + angle
+        points = torch.stack([15 + width * turn.cos(), 11 + height * turn.sin()], 1)
+        sides = torch.stack([torch.arange(count), (torch.arange(count) + 1) % count], 1).numpy()
+    else:
+        way = torch.randint(-3, 4, (2,), generator=generator).double()
+        way[0] += way.abs().sum() == 0
+        place = torch.randperm(4 * count, generator=generator)[:count].sort().values
+        points = torch.tensor([15.0, 11.0]) + (place[:, None] - 2 * count) / 8 * way  # exactly collinear
+        sides = torch.stack([torch.arange(count - 1), torch.arange(1, count)], 1).numpy()
+    value = torch.rand(count, generator=generator, dtype=torch.float64) * 20
+    order = torch.randperm(count, generator=generator)
+    found = interpolate_disparity(anchors(points[order], value[order]), SIZE)[0, 0].numpy()
+    where = torch.stack(pixels(), -1).numpy()
+    start, way = points.numpy()[sides[:, 0]], (points[sides[:, 1]] - points[sides[:, 0]]).numpy()
+    gap = where[:, :, None] - start  # (H, W, K, 2)
+    share = ((gap * way).sum(-1) / (way * way).sum(-1)).clip(0, 1)
+    nearest = ((gap - share[..., None] * way) ** 2).sum(-1).argmin(-1)[..., None]
+    share = np.take_along_axis(share, nearest, -1)[..., 0]
+    low, high = (value.numpy()[sides[:, end]][nearest[..., 0]] for end in (0, 1))
+    outside = (way[:, 0] * gap[..., 1] - way[:, 1] * gap[..., 0] < -1e-5).any(-1) | (kind == "path") | (count == 2)
+    np.testing.assert_allclose(found[outside], (low + share * (high - low))[outside], rtol=0, atol=1e-5)
+
+
 def test_collinear_anchors_are_a_line() -> None:
     points = torch.tensor([[2.0, 3.0], [6.0, 3.0], [4.0, 3.0]])
     found = interpolate_disparity(anchors(points, torch.tensor([1.0, 2.0, 5.0])), (5, 9))[0, 0]
@@ -139,12 +170,26 @@ def test_batch_is_the_loop_over_pairs(counts: list[int], seed: int, whole: bool)
         torch.testing.assert_close(same[k, :, :5, :21], alone[:, :5, :21], rtol=0, atol=0, equal_nan=True)
 
 
-@given(st.integers(3, 80), st.integers(0, 10**6))
-def test_order_of_matches_changes_nothing(count: int, seed: int) -> None:
+@pytest.mark.parametrize("at_once", [1, 40, 700])
+def test_number_of_pixels_at_once_changes_nothing(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = collate_matches([random_matches(count, count) for count in (30, 0, 1, 2, 60)])
+    sizes = [(23, 31), (4, 9), (17, 3), (1, 40), (12, 31)]
+    for max_step_px in (None, 4):
+        expected = interpolate_disparity(batch, sizes, max_step_px=max_step_px)
+        with monkeypatch.context() as patch:
+            patch.setattr(interpolation, "_AT_ONCE", at_once)
+            found = interpolate_disparity(batch, sizes, max_step_px=max_step_px)
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+
+
+@given(st.integers(2, 80), st.integers(0, 10**6), st.sampled_from([None, 6]))
+def test_order_of_matches_changes_nothing(count: int, seed: int, max_step_px: float | None) -> None:
     matches = random_matches(count, seed, whole=True)  # with many co-circular points
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
     mixed = anchors(matches.keypoints0[order], matches.disparity[order])
-    assert torch.equal(interpolate_disparity(matches, SIZE), interpolate_disparity(mixed, SIZE))
+    one, other = (interpolate_disparity(given, SIZE, max_step_px=max_step_px) for given in (matches, mixed))
+    assert torch.equal(one, other)
 
 
 def test_of_coincident_anchors_score_then_cost_then_order_decides() -> None:
@@ -192,9 +237,55 @@ def test_pixels_of_a_cut_triangle_go_to_the_nearest_corner() -> None:
     assert bool((found[:, 6:] == 9).all())
 
 
+def test_pixels_on_the_sides_of_a_cut_triangle_are_its_own_however_they_round() -> None:
+    generator = torch.Generator().manual_seed(0)
+    pixel = torch.tensor([15.0, 11.0], dtype=torch.float64)
+    pairs = []
+    for angle in (torch.rand(200, generator=generator, dtype=torch.float64) * 2 * math.pi).tolist():
+        way = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+        across = torch.tensor([-math.sin(angle), math.cos(angle)], dtype=torch.float64)
+        before, behind = (1 + 3 * torch.rand(2, generator=generator, dtype=torch.float64)).tolist()
+        points = pixel + torch.stack([-before * way, behind * way, across / 2])
+        pairs.append(anchors(points, torch.tensor([1.0, 9.0, 20.0]).double()))
+    maps = interpolate_disparity(collate_matches(pairs), SIZE, max_step_px=4)
+    torch.testing.assert_close(maps[:, 0, 11, 15], torch.full((200,), 20.0).double())  # of the nearest corner
+
+
+@pytest.mark.parametrize(("sign", "expected"), [(1, [0.0, 0.0, 2.0]), (-1, [0.5, 1.0, 1.5])])
+def test_pixels_between_a_cut_triangle_and_another_go_to_the_later_one(sign: int, expected: list[float]) -> None:
+    corners = torch.tensor([[0.0, -2.0], [0.0, 2.0], [-3.0, 0.0], [3.0, 0.0]])  # lower, upper, and one on each side
+    points = corners * torch.tensor([sign, 1.0]) + torch.tensor([4.0, 3.0])
+    found = interpolate_disparity(anchors(points, torch.tensor([0.0, 2.0, 1.0, 9.0])), (7, 9), max_step_px=4)
+    assert found[0, 0, 2:5, 4].tolist() == expected
+
+
+@given(st.integers(3, 30), st.integers(0, 10**6), st.sampled_from([1e-6, 1e-7, 1e-8, 1e-10, 1e-13]), st.booleans())
+def test_anchors_hardly_off_the_pixels_are_neither_overshot_nor_without_gradient(
+    count: int, seed: int, offset: float, together: bool
+) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    cell = torch.randint(0, 7, (count, 2), generator=generator)
+    shift = torch.randn(1 if together else count, 2, generator=generator, dtype=torch.float64)
+    points = (cell + offset * shift).requires_grad_()
+    disparity = torch.rand(count, generator=generator, dtype=torch.float64) * 20
+    matches = Matches(points, anchors(points.detach(), disparity).keypoints1, torch.tensor([0, count]))
+    found = interpolate_disparity(matches, (9, 9))
+    assert bool((found.detach() >= disparity.min() - 1e-12).all())
+    assert bool((found.detach() <= disparity.max() + 1e-12).all())
+    found.sum().backward()
+    assert points.grad is not None
+    assert bool(points.grad.isfinite().all())
+
+
 @pytest.mark.parametrize("count", [1, 2, 9])
 def test_gradients_with_respect_to_both_keypoints(count: int) -> None:
-    matches = random_matches(count, 5)
+    points = torch.rand(count, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = points * torch.tensor([6.4, 5.4])
+    matches = anchors(points, random_matches(count, 5).disparity)
+    if count > 2:
+        x, y = (values[:6, :7] for values in pixels())
+        inside = LinearNDInterpolator(points.numpy(), np.zeros(count))(x, y)
+        assert 10 <= np.isfinite(inside).sum() <= 32  # of 42 pixels
 
     def run(keypoints0: Tensor, keypoints1: Tensor) -> Tensor:
         return interpolate_disparity(Matches(keypoints0, keypoints1, matches.ptr), (6, 7))
@@ -227,10 +318,17 @@ def test_dtype_follows_the_keypoints(dtype: torch.dtype) -> None:
     torch.testing.assert_close(found.double(), interpolate_disparity(matches, SIZE), rtol=0, atol=1e-3)
 
 
+def test_sizes_may_be_integers_of_numpy() -> None:
+    matches = random_matches(9, 0)
+    height, width = np.array(SIZE)
+    assert torch.equal(interpolate_disparity(matches, (height, width)), interpolate_disparity(matches, SIZE))
+    assert torch.equal(interpolate_disparity(matches, [(height, width)])[0], interpolate_disparity(matches, SIZE)[0])
+
+
 def test_errors_name_the_argument() -> None:
     matches = random_matches(4, 0)
     everything = torch.ones(4)
-    for size in ((0, 5), (4.0, 5), 7, (4, 5, 6), [(4, 5), (4,)], [(4, 0)]):
+    for size in ((0, 5), (4.0, 5), (True, 5), (4, np.True_), 7, (4, 5, 6), [(4, 5), (4,)], [(4, 0)], [(4, True)]):
         with pytest.raises(ValueError, match="size must be"):
             interpolate_disparity(matches, size)  # type: ignore[call-overload]
     with pytest.raises(ValueError, match="one per pair"):
@@ -245,6 +343,11 @@ def test_errors_name_the_argument() -> None:
         interpolate_disparity(matches, SIZE, score=everything.long())
     with pytest.raises(ValueError, match="score must not be NaN, got NaN in row 2"):
         interpolate_disparity(matches, SIZE, score=torch.tensor([1.0, 1.0, torch.nan, 1.0]))
+    for options in ({}, {"inlier": everything > 0}):
+        with pytest.raises(ValueError, match=r"min_score must be a number, and given only with score, got 0\.2"):
+            interpolate_disparity(matches, SIZE, min_score=0.2, **options)
+    with pytest.raises(ValueError, match="min_score must be a number, and given only with score, got nan"):
+        interpolate_disparity(matches, SIZE, score=everything, min_score=math.nan)
     with pytest.raises(ValueError, match="max_step_px must be at least 0 px, got -1"):
         interpolate_disparity(matches, SIZE, max_step_px=-1)
     costly = Matches(matches.keypoints0, matches.keypoints1, matches.ptr, torch.tensor([1.0, torch.nan, 1.0, 1.0]))

@@ -20,8 +20,9 @@ def delaunay_triangles(points: Float, ptr: Int) -> tuple[Int, Int]:
 
     Returns:
         triangles: (T, 3) int64 counter-clockwise vertices, the lexicographically first one in front; sorted by vertex.
-        boundary: (H, 2) int64 edges of the convex hulls. Collinear points, which have no triangle, give the edges of
-            their path, a single point the edge to itself.
+        boundary: (H, 2) int64 edges of the convex hulls, counter-clockwise. Collinear points, which have no triangle,
+            give the edges of their path in lexicographic order, a single point the edge to itself. The rows are in
+            lexicographic order of the points in which the edges start.
 
     Example:
         >>> import numpy as np
@@ -34,6 +35,7 @@ def delaunay_triangles(points: Float, ptr: Int) -> tuple[Int, Int]:
     rank = np.empty(len(points), dtype=np.int64)
     rank[np.lexsort((points[:, 1], points[:, 0]))] = np.arange(len(points))
     triangles = np.concatenate([_fans(rank, mesh) for mesh in meshes])
+    paths = np.take_along_axis(paths, rank[paths].argsort(1), 1)
     single = ptr[:-1][np.diff(ptr) == 1]
     hulls = [mesh.edges[mesh.triangle[:, 1] == HULL] for mesh in meshes]
     boundary = np.concatenate([*hulls, paths, np.stack([single, single], 1)])

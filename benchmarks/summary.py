@@ -21,7 +21,7 @@ def print_comparisons(*suites: str) -> None:
     for record in (r for suite in suites for r in records(suite)):
         if "case" not in record:
             continue
-        if record["title"] != ours.get("title"):
+        if any(record[key] != ours.get(key) for key in ("title", "threads")):
             ours = record
             continue
         time = ours["wall_s"]["median"] / ours["units"]

@@ -29,7 +29,7 @@ from tensor_stereo.scores.quantities import (
 from tensor_stereo.types import Adjacency, Matches
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-_MATCHES_AT_ONCE = 4096  # whose edges stay in the cache
+_MATCHES_AT_ONCE = 8192  # whose edges stay in the cache, and are enough for two threads
 _WIDTH, _EDGE_WIDTH, _ROUNDS = 24, 12, 3
 _NUM_PLANE = 9
 _MAX_NORMALIZED = 4.0  # standard deviations

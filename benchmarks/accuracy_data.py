@@ -11,13 +11,15 @@ import torch
 from numpy.typing import NDArray
 
 import tensor_stereo as ts
+from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.datasets import SyntheticDataset, find_pairs, read_pair
+from tensor_stereo.features import detect_features
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Gray = NDArray[np.uint8]
 
-DETECTORS = ("sift", "fast", "gftt")
+DETECTORS = ("sift", "fast", "surf", "gftt")
 MAX_ROW_OFFSET_PX, MAX_DISPARITY_PX = 1.0, 128.0  # the gates
 MAX_ERROR_PX = 1.0
 RATIO = 0.8  # of SIFT
@@ -92,7 +94,7 @@ def find_putatives(pair: GrayPair, detector: str, *, gated: bool) -> Putatives:
     """Nearest neighbours by SSD, one-to-one by lowest cost; SIFT with Lowe's ratio test at 0.8.
 
     FAST keeps the 2000 strongest at threshold 20, GFTT 1000 corners at quality .01 and distance 3 px, SIFT 2000
-    features. Windows of 11 x 11 px describe FAST and GFTT.
+    features, all of them OpenCV's, and SURF 2000 of mahotas'. Windows of 11 x 11 px describe FAST and GFTT.
     """
     (points0, descriptors0), (points1, descriptors1) = (_detect(image, detector) for image in (pair.left, pair.right))
     ssd = (descriptors0**2).sum(1)[:, None] + (descriptors1**2).sum(1)[None] - 2 * descriptors0 @ descriptors1.T
@@ -163,6 +165,9 @@ def _detect(image: Gray, detector: str) -> tuple[Float, NDArray[np.float32]]:
     if detector == "sift":
         found, descriptors = cv2.SIFT_create(2000).detectAndCompute(image, None)
         return np.array([k.pt for k in found], float), descriptors
+    if detector == "surf":
+        features = detect_features(torch.from_numpy(image)[None, None], PipelineConfig(detector="surf"))
+        return features.keypoints.double().numpy(), features.descriptors.numpy()
     maker = cv2.FastFeatureDetector.create(20) if detector == "fast" else cv2.GFTTDetector.create(1000, 0.01, 3)
     found = maker.detect(image)
     if detector == "fast":

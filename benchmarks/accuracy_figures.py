@@ -20,7 +20,9 @@ def _style(name: str) -> dict:
 
 def draw_roc(group: str, grid: np.ndarray, panels: dict[str, dict[str, np.ndarray]]) -> None:
     """results/accuracy_roc_GROUP.png: one panel per kind of putative matches, the mean curve over scenes."""
-    figure, axes = plt.subplots(2, 3, figsize=(12, 7.5), sharex=True, sharey=True, constrained_layout=True)
+    figure, axes = plt.subplots(
+        2, len(panels) // 2, figsize=(2 * len(panels), 7.5), sharex=True, sharey=True, constrained_layout=True
+    )
     for axis, (title, curves) in zip(axes.T.flat, panels.items(), strict=True):
         for name in SHOWN:
             axis.plot(grid, curves[name], **_style(name))

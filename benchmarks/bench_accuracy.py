@@ -47,17 +47,18 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     """95 % interval of the mean over scenes: percentiles over scenes drawn with replacement, always the same ones."""
     rows = np.random.default_rng(0).integers(len(values), size=(NUM_RESAMPLES, len(values)))
     low, high = np.nanpercentile(np.nanmean(values[rows], 1), [2.5, 97.5])
-    return float(low), float(high)
+    return round(float(low), 4), round(float(high), 4)
 
 
 def report(suite: Suite, title: dict[str, object], figures: Figures, curves: Figures | None = None) -> None:
     """Print and keep the mean of each score with its interval, and ours against the best peer of the row."""
     print(", ".join(f"{key} {value}" for key, value in title.items()))
     for name, scenes in figures.items():
-        auc, specificity = np.nanmean(scenes, 0)
+        auc, specificity = np.nanmean(scenes, 0).tolist()
         record = {
-            **title, "score": name, "auc": auc, "auc_interval": interval(scenes[:, 0]),
-            "specificity_at_96": specificity, "specificity_interval": interval(scenes[:, 1]), "scenes": len(scenes),
+            **title, "score": name, "auc": round(auc, 5), "auc_interval": interval(scenes[:, 0]),
+            "specificity_at_96": round(specificity, 5), "specificity_interval": interval(scenes[:, 1]),
+            "scenes": len(scenes),
         }  # fmt: skip
         if curves is not None:
             record["roc_specificity"] = np.nanmean(curves[name], 0).round(4).tolist()
@@ -74,7 +75,7 @@ def report(suite: Suite, title: dict[str, object], figures: Figures, curves: Fig
                 "score": name,
                 "gain": merit,
                 "over": peer,
-                "mean": np.nanmean(gain),
+                "mean": round(float(np.nanmean(gain)), 5),
                 "interval": [low, high],
             }
             suite.records.append(record)

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from accuracy_data import DETECTORS, GrayPair, Putatives, find_putatives, load_pairs, to_matches
+from accuracy_data import GrayPair, Putatives, find_putatives, load_pairs, to_matches
 from accuracy_peers import score_disparity, score_lpm
 from dense_figures import draw_bars, draw_maps
 from harness import Suite
@@ -29,6 +29,7 @@ from tensor_stereo.scores.consensus import consensus_score
 from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.learned import LearnedScore, load_learned
 
+DETECTORS = ("sift", "fast", "gftt")
 BAD_PX = 2.0
 MIN_GAP = 0.002  # of bad-2px, between the best peer and the oracle
 MAX_STEP_PX = 4.0  # where triangles are cut; of 2, 4, 8 and 16 the best on the training scenes

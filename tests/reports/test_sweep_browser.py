@@ -200,7 +200,7 @@ def test_lists_offer_every_value_in_order(opened: Callable[..., Report], results
     report = opened(make_run("run", frame))
     options = "[...document.querySelectorAll('#table-trials .controls label')].map(l => [l.firstChild.textContent, "
     found = dict(report.browser.run(f"{options}[...l.querySelectorAll('option')].map(o => o.text)])"))
-    assert found["threshold"] == ["all", "5", "10", "set test"]
+    assert found["threshold"] == ["all", "5", "10", "–"]
     assert found["outliers"] == ["all", "0", "0.3"]
     assert found["detector"] == ["all", "fast", "sift"]
 

@@ -115,6 +115,8 @@ def test_labels_name_words_and_numbers() -> None:
         "sift, max. ratio off, noise px 0, no score, set test"
     )
     assert settings_label(row, []) == "all settings alike"
+    aimed = row | {"score": "learned", "threshold": None, "min_precision": 0.9}
+    assert settings_label(aimed, ["threshold", "score", "min_precision"]) == "learned, min. precision 0.9"
 
 
 def test_mildest_perturbation_is_found_per_detector() -> None:

@@ -43,7 +43,7 @@ SETTINGS = {
     "score": Setting("score"),
     "temperature": Setting("temperature"),
     "temperature_unit": Setting("unit"),
-    "threshold": Setting("threshold", "set test"),
+    "threshold": Setting("threshold"),
     "target_sensitivity": Setting("target sens."),
     "min_precision": Setting("min. precision"),
 }
@@ -105,12 +105,12 @@ def settings_label(row: Mapping[str, Any], names: Sequence[str]) -> str:
     parts = []
     for name in names:
         text = setting_text(name, row[name])
-        if text == Setting.none or (text == SETTINGS["threshold"].none and decided_by_score(row)):
-            continue
-        if name == "score" and text == "none":
-            text = "no score"
-        itself = isinstance(row[name], str) or (row[name] is None and name == "threshold")
-        parts.append(text if itself else f"{SETTINGS[name].heading} {text}")
+        if name == "threshold" and not decided_by_score(row):
+            parts.append("set test")
+        elif name == "score" and text == "none":
+            parts.append("no score")
+        elif text != Setting.none:
+            parts.append(text if isinstance(row[name], str) else f"{SETTINGS[name].heading} {text}")
     return ", ".join(parts) or "all settings alike"
 
 

@@ -71,7 +71,7 @@ def assert_same(
         assert (float(found.first[row]), int(found.num_columns[row])) == (first, count)
         images, places = (gray[0][b], gray[1][b]), (points[0][row], points[1][row])
         values, *curves = measure_match(images, places, first, count)
-        wrong = np.flatnonzero(abs(found.values[row].numpy() - values) > ATOL)
+        wrong = np.flatnonzero(~(abs(found.values[row].numpy() - values) <= ATOL))  # NaN too
         told = [(names[k], float(found.values[row, k]), values[k]) for k in wrong]
         assert not told, f"match {row} at {places}: {told}"
         for given, curve in zip((found.curve0, found.curve1), curves, strict=True):
@@ -185,3 +185,25 @@ def test_search_ranges_are_those_of_votes_one_by_one(levels: tuple[int, ...], wh
         views = [torch.from_numpy(view.round() if whole else view) for view in (left, right)]
         matches = Matches(*views, torch.tensor([0, *lengths]).cumsum(0))
         assert search_ranges(matches, build_match_graphs(matches)) == ranges_of(matches)
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "expected"),
+    [
+        ([(20, 31)], (16, 9)),  # four on either side
+        ([(0, 31), (195, 31)], (-30, 256)),  # 29.25 on either side
+        ([(0, 31), (196, 31)], (-3, 256)),  # 29.4 are too many; three places before the first match must do
+        ([(0, 31), (400, 20)], (-3, 256)),
+        ([(0, 20), (400, 31)], (397, 256)),
+        ([(0, 12), (251, 12), (505, 14)], (502, 256)),  # 251 has not three places behind it, if 0 has three before
+        ([(0, 12), (249, 12), (505, 14)], (-3, 256)),
+        ([(20, 8), (800, 1)], (16, 9)),  # one match alone has no vote
+        ([(20, 7), (200, 1)], (-6, 220)),  # seven are too few to be believed; all span 0.93 * 180, 25.1 on either side
+    ],
+)
+def test_search_ranges_of_level_surfaces(surfaces: list[tuple[int, int]], expected: tuple[int, int]) -> None:
+    disparity = torch.cat([torch.full((count,), level) for level, count in surfaces]).double()
+    row = torch.arange(len(disparity)) % 4
+    left = torch.stack([torch.arange(len(disparity)) * 3.0, row * 20.0 + torch.arange(len(disparity)) % 3], 1).double()
+    matches = Matches(left, left - disparity[:, None] * torch.tensor([1.0, 0.0]), torch.tensor([0, len(disparity)]))
+    assert search_ranges(matches, build_match_graphs(matches)) == [expected]

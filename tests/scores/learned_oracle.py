@@ -204,7 +204,8 @@ def _measure_view(
 
 
 def _sample(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return map_coordinates(image, [y, x], order=1, mode="nearest")  # bilinear, the border repeated
+    height, width = image.shape
+    return map_coordinates(image, [y.clip(0, height - 1), x.clip(0, width - 1)], order=1)  # bilinear, border repeated
 
 
 def _window(image: np.ndarray, x: float, y: float) -> np.ndarray:

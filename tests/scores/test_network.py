@@ -140,3 +140,10 @@ def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.Monk
         found = score_learned(given, build_match_graphs(given), evidence)
         # these weights tell by disparities: a logit changes by up to 10 times the difference of a quantity
         np.testing.assert_allclose(found, 1 / (1 + np.exp(-slope * logit - bias)), rtol=0, atol=1e-3)
+
+
+def test_no_pairs_have_no_score() -> None:
+    matches = random_pairs(0, ())
+    score = score_learned(matches, build_match_graphs(matches))
+    assert score.shape == (0,)
+    assert score.dtype == torch.float32

@@ -102,7 +102,7 @@ def test_pairs_of_any_size_and_kind_with_keypoints_outside() -> None:
     matches = random_pairs(1, (14, 0, 12, 1, 9))
     left, right = matches.keypoints0.clone(), matches.keypoints1.clone()
     left[2], right[3] = torch.tensor([1e4, 30.0]), torch.tensor([20.0, -1e4])  # 1e4 px: far beyond the search range
-    left[5, 1], right[6, 1] = -1e20, 1e20  # no int64 holds that
+    left[5], right[6] = torch.tensor([[1e20, -1e20], [-1e20, 1e20]])  # no int64 holds that
     left[15], right[15] = torch.tensor([-4.25, 63.0]), torch.tensor([90.5, -6.75])
     left[16, 0], right[17, 1] = WIDTH - 1, HEIGHT - 1  # on the last pixels
     matches = replace(matches, keypoints0=left, keypoints1=right)

@@ -13,7 +13,7 @@ from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores import learned
 from tensor_stereo.scores.evidence import ImageEvidence
 from tensor_stereo.scores.learned import LearnedScore, load_learned, score_learned
-from tensor_stereo.scores.quantities import measure_quantities
+from tensor_stereo.scores.quantities import Quantities, measure_quantities
 from tensor_stereo.types import Adjacency, Matches
 from tests.scores.learned_oracle import infer, random_evidence, random_pairs, see, weights_of
 
@@ -130,7 +130,14 @@ def test_gradients_are_the_central_differences_of_the_definition(shown: bool) ->
 
 @pytest.mark.parametrize("shown", [True, False])
 def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = []
+
+    def measure(matches: Matches, *rest: object) -> Quantities:
+        sizes.append(matches.num_matches)
+        return measure_quantities(matches, *rest)
+
     monkeypatch.setattr(learned, "_MATCHES_AT_ONCE", 40)
+    monkeypatch.setattr(learned, "measure_quantities", measure)
     matches = random_pairs(8, (25, 0, 15, 1, 45, 2))
     evidence = random_evidence(8, matches, seen=0.7) if shown else None
     for given in (matches, replace(matches, cost=None)):
@@ -140,6 +147,7 @@ def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.Monk
         found = score_learned(given, build_match_graphs(given), evidence)
         # these weights tell by disparities: a logit changes by up to 10 times the difference of a quantity
         np.testing.assert_allclose(found, 1 / (1 + np.exp(-slope * logit - bias)), rtol=0, atol=1e-3)
+    assert sizes == [40, 1, 45, 2] * 2
 
 
 def test_no_pairs_have_no_score() -> None:

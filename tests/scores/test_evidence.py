@@ -40,6 +40,15 @@ def textured_views(seed: int, height: int = HEIGHT, width: int = WIDTH, *, noise
     return [torch.from_numpy(view.clip(0, 255).round()).to(torch.uint8)[None] for view in (texture, moved)]
 
 
+def level_surfaces(surfaces: list[tuple[int, int]], row_offset: float = 0.0) -> Matches:
+    """``surfaces``: disparity in px and number of matches of each, from left to right."""
+    disparity = torch.cat([torch.full((count,), level) for level, count in surfaces]).double()
+    place = torch.arange(len(disparity))
+    left = torch.stack([place * 3.0, place % 4 * 20.0 + place % 3], 1).double()
+    shift = torch.stack([disparity, torch.full_like(disparity, row_offset)], 1)
+    return Matches(left, left - shift, torch.tensor([0, len(disparity)]))
+
+
 def ranges_of(matches: Matches) -> list[tuple[int, int]]:
     graphs = build_match_graphs(matches)
     near = [neighbor_sets(adjacency) for adjacency in graphs[:2]]
@@ -203,8 +212,11 @@ def test_search_ranges_are_those_of_votes_one_by_one(levels: tuple[int, ...], wh
     ],
 )
 def test_search_ranges_of_level_surfaces(surfaces: list[tuple[int, int]], expected: tuple[int, int]) -> None:
-    disparity = torch.cat([torch.full((count,), level) for level, count in surfaces]).double()
-    row = torch.arange(len(disparity)) % 4
-    left = torch.stack([torch.arange(len(disparity)) * 3.0, row * 20.0 + torch.arange(len(disparity)) % 3], 1).double()
-    matches = Matches(left, left - disparity[:, None] * torch.tensor([1.0, 0.0]), torch.tensor([0, len(disparity)]))
+    matches = level_surfaces(surfaces)
+    assert search_ranges(matches, build_match_graphs(matches)) == [expected]
+
+
+@pytest.mark.parametrize(("row_offset", "expected"), [(1.5, (16, 9)), (-1.5, (16, 9)), (1.625, (17, 256))])
+def test_matches_off_their_rows_have_no_vote(row_offset: float, expected: tuple[int, int]) -> None:
+    matches = level_surfaces([(20, 12), (800, 1)], row_offset)
     assert search_ranges(matches, build_match_graphs(matches)) == [expected]

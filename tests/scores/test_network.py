@@ -138,7 +138,7 @@ def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(learned, "_MATCHES_AT_ONCE", 40)
     monkeypatch.setattr(learned, "measure_quantities", measure)
-    matches = random_pairs(8, (25, 0, 15, 1, 45, 2))
+    matches = random_pairs(8, (25, 15, 1, 45, 2, 0, 3))
     evidence = random_evidence(8, matches, seen=0.7) if shown else None
     for given in (matches, replace(matches, cost=None)):
         seen, network = see(given, evidence), load_learned()
@@ -147,7 +147,7 @@ def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.Monk
         found = score_learned(given, build_match_graphs(given), evidence)
         # these weights tell by disparities: a logit changes by up to 10 times the difference of a quantity
         np.testing.assert_allclose(found, 1 / (1 + np.exp(-slope * logit - bias)), rtol=0, atol=1e-3)
-    assert sizes == [40, 1, 45, 2] * 2
+    assert sizes == [40, 1, 45, 5] * 2
 
 
 def test_no_pairs_have_no_score() -> None:

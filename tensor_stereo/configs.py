@@ -1,22 +1,38 @@
-"""Settings of every step, as frozen dataclasses with units in the field names. Imports no torch."""
+"""Settings of every step, as frozen dataclasses with units in the field names, checked when made. Imports no torch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal, NoReturn, get_args
+
+from tensor_stereo.limits import Count, Fraction, OddPx, Positive, Within, check_settings
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
+Verdict = Literal["score", Restriction]
 TemperatureUnit = Literal["edge", "px"]
 Score = Literal["topology", "consensus", "learned"]
-ScoreName = Literal["none", Score]  # none: no score, and no curve in the results
+ResolvedScore = Literal["none", Score]  # none: no score, and no curve in the results
+ScoreName = Literal["auto", ResolvedScore]
 Backend = Literal["auto", "native", "scipy"]
 
 RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 SCORES: tuple[Score, ...] = get_args(Score)
-CUTS = ("threshold", "target_sensitivity", "min_precision")  # ways to a verdict by score, of which one may be given
+CUTS = ("threshold", "target_sensitivity", "min_precision")  # ways from a score to a verdict; one may be given
+LIKELY = 0.5  # probability from which a match is kept where no such way is given
 DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4
+COLDEST, HOTTEST = 1e-9, 1e9  # temperatures whose gradients are finite in float32 too
+
+
+def __getattr__(name: str) -> NoReturn:
+    if name == "ClassifyConfig":
+        raise ImportError("ClassifyConfig is FilterConfig now, and its restriction is verdict")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+Ratio = Annotated[float, Within(0, 1, open_low=True)]
 
 
 @dataclass(frozen=True)
@@ -24,30 +40,39 @@ class SIFTConfig:
     """Scale-invariant feature transform (Lowe 2004): sub-pixel keypoints, 128-vectors."""
 
     backend: Literal["kornia", "opencv"] = "kornia"
-    max_keypoints: int = 2000
+    max_keypoints: Count = 2000
     upright: bool = False  # no orientation: more matches between rectified views, a little fewer of them correct
-    max_ratio: float | None = 0.8  # best / second-best distance; Lowe 2004; None: no test
+    max_ratio: Ratio | None = 0.8  # best / second-best distance; Lowe 2004; None: no test
+
+    def __post_init__(self) -> None:
+        check_settings(self, prefix="SIFTConfig.")
 
 
 @dataclass(frozen=True)
 class FASTConfig:
     """Features from accelerated segment test (Rosten & Drummond 2006), OpenCV's detector, with image windows."""
 
-    threshold: int = 20  # grey levels by which the arc must differ from the centre
+    threshold: Annotated[int, Within(0, 255)] = 20  # grey levels by which the arc must differ from the centre
     nonmax_suppression: bool = True
-    max_keypoints: int = 2000  # the strongest are kept
-    window_px: int = 11  # side of the square window that SSD compares, odd
+    max_keypoints: Count = 2000  # the strongest are kept
+    window_px: OddPx = 11  # side of the square window that SSD compares, odd
+
+    def __post_init__(self) -> None:
+        check_settings(self, prefix="FASTConfig.")
 
 
 @dataclass(frozen=True)
 class SURFConfig:
     """Speeded-up robust features (Bay et al. 2006), mahotas' implementation, 64-vectors."""
 
-    num_octaves: int = 4
-    num_scales: int = 6
-    initial_step_px: int = 1
-    threshold: float = 0.1  # on the determinant of the Hessian, in mahotas' scale
-    max_keypoints: int = 2000
+    num_octaves: Annotated[int, Within(1, 8)] = 4
+    num_scales: Annotated[int, Within(3, 16)] = 6
+    initial_step_px: Annotated[int, Within(1, 16)] = 1
+    threshold: Annotated[float, Within(0)] = 0.1  # on the determinant of the Hessian, in mahotas' scale
+    max_keypoints: Count = 2000
+
+    def __post_init__(self) -> None:
+        check_settings(self, prefix="SURFConfig.")
 
 
 @dataclass(frozen=True)
@@ -55,79 +80,41 @@ class GFTTConfig:
     """Good features to track (Shi & Tomasi 1994), with image windows."""
 
     backend: Literal["kornia", "opencv"] = "kornia"
-    quality_level: float = 0.01  # fraction of the image's strongest response
-    min_distance_px: int = 3
-    max_keypoints: int = 1000
-    window_px: int = 11  # side of the square window that SSD compares, odd
+    quality_level: Annotated[float, Within(1e-9, 1)] = 0.01  # fraction of the image's strongest response
+    min_distance_px: Annotated[int, Within(0, 2**15)] = 3
+    max_keypoints: Count = 1000
+    window_px: OddPx = 11  # side of the square window that SSD compares, odd
+
+    def __post_init__(self) -> None:
+        check_settings(self, prefix="GFTTConfig.")
 
 
 @dataclass(frozen=True)
 class MatchingConfig:
     """Nearest neighbour by sum of squared differences, one-to-one by lowest cost. ``None`` switches a gate off."""
 
-    max_ratio: float | None = None  # best / second-best distance; None: what the detector's own settings say
+    max_ratio: Ratio | None = None  # best / second-best distance; None: what the detector's own settings say
     mutual: bool = False  # keep only pairs that are each other's nearest neighbour
-    max_row_offset_px: float | None = None  # |y0 - y1|
-    min_disparity_px: float | None = None  # x0 - x1
-    max_disparity_px: float | None = None
+    max_row_offset_px: Annotated[float, Within(0)] | None = None  # |y0 - y1|
+    min_disparity_px: Annotated[float, Within(open_high=True)] | None = None  # x0 - x1
+    max_disparity_px: Annotated[float, Within(open_low=True)] | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self, prefix="MatchingConfig.")
+        low, high = self.min_disparity_px, self.max_disparity_px
+        if low is not None and high is not None and low > high:
+            raise ValueError(f"MatchingConfig.min_disparity_px must be at most max_disparity_px, got {low} > {high}")
 
 
 @dataclass(frozen=True)
 class ObjectsConfig:
     """Object contours of Restriction 3 (the paper, section 3)."""
 
-    element_px: int = 5  # side of the square structuring element, odd
-    min_area_px: float = 50.0  # area that a contour must enclose
-
-
-@dataclass(frozen=True)
-class ClassifyConfig:
-    """The set test on the two Delaunay graphs (the paper, section 3), and the score of every match beside it.
-
-    ``threshold``, ``target_sensitivity`` or ``min_precision`` make the verdict one of the score instead of the
-    restriction. The last two choose the threshold of each pair from calibrated scores, by what these let expect.
-    """
-
-    restriction: Restriction = "cardinality"
-    min_group_size: int = 4  # distinct matches below which a group says nothing
-    tie_tolerance: float = 1e-3  # in edge lengths
-    backend: Backend = "auto"
-    score: ScoreName = "consensus"
-    temperature: float = 1.0  # of the score topology
-    temperature_unit: TemperatureUnit = "edge"
-    threshold: float | None = None  # least score of a match that is kept
-    target_sensitivity: float | None = None  # fraction of the incorrect matches that are rejected, at least
-    min_precision: float | None = None  # fraction of the kept matches that are correct, at least
+    element_px: OddPx = 5  # side of the square structuring element, odd
+    min_area_px: Annotated[float, Within(0)] = 50.0  # area that a contour must enclose
 
     def __post_init__(self) -> None:
-        given = [name for name in CUTS if getattr(self, name) is not None]
-        for name in given:
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must lie in [0, 1] or be None, got {value}")
-            if self.score == "none":
-                raise ValueError(f"{name} must be None where score is 'none', got {value}")
-            if self.score == "topology" and name != "threshold":
-                raise ValueError(f"{name} needs a calibrated score, which 'topology' is not; got {value}")
-        if len(given) > 1:
-            raise ValueError(f"{given[1]} must be None beside {given[0]}, got {getattr(self, given[1])}")
-
-    @property
-    def by_score(self) -> bool:
-        """Whether the score decides, not the restriction."""
-        return any(getattr(self, name) is not None for name in CUTS)
-
-
-def describe_verdict(settings: Mapping[str, Any]) -> str:
-    """What decides under some settings, in a few words.
-
-    >>> describe_verdict({"restriction": "adjacency"}), describe_verdict({"score": "learned", "min_precision": 0.9})
-    ('adjacency', 'learned, min precision 0.9')
-    """
-    for name in CUTS:
-        if settings.get(name) is not None:
-            return f"{settings['score']}, {name.replace('_', ' ')} {settings[name]:g}"
-    return str(settings["restriction"])
+        check_settings(self, prefix="ObjectsConfig.")
 
 
 @dataclass(frozen=True)
@@ -138,22 +125,160 @@ class ConsensusConfig:
     keypoints; what lies between is interpolated. Which keypoints are given is measured, pair by pair.
     """
 
-    tolerance_px: float = 0.6  # difference to a neighbour's plane at which agreement has fallen to exp(-1/2)
-    whole_tolerance_px: float = 1.0
-    row_tolerance_px: float | None = 0.25  # row offset that halves the odds; None: the pair is not rectified
-    whole_row_tolerance_px: float = 1.5
-    slope: float = 0.2  # expected change of the displacement per px of distance, px/px
-    reach: float = 2.0  # distance, in edge lengths around the match, at which a neighbour's vote counts half
-    doubt: float = 1.0  # votes against every match, so that few votes are less than many
-    cost_weight: float = 0.5  # log-odds per standard deviation of the logarithm of the cost
-    num_rounds: int = 2
+    tolerance_px: Positive = 0.6  # difference to a neighbour's plane at which agreement has fallen to exp(-1/2)
+    whole_tolerance_px: Positive = 1.0
+    row_tolerance_px: Positive | None = 0.25  # row offset that halves the odds; None: the pair is not rectified
+    whole_row_tolerance_px: Positive = 1.5
+    slope: Positive = 0.2  # expected change of the displacement per px of distance, px/px
+    reach: Positive = 2.0  # distance, in edge lengths around the match, at which a neighbour's vote counts half
+    doubt: Positive = 1.0  # votes against every match, so that few votes are less than many
+    cost_weight: Annotated[float, Within(0, open_high=True)] = (
+        0.5  # log-odds per standard deviation of the logarithm of the cost
+    )
+    num_rounds: Annotated[int, Within(1, 1000)] = 2
+
+    def __post_init__(self) -> None:
+        check_settings(self, prefix="ConsensusConfig.")
+
+    @property
+    def rectified(self) -> bool:
+        """Whether the offset between the rows of a match is evidence."""
+        return self.row_tolerance_px is not None
 
 
 UNRECTIFIED = ConsensusConfig(row_tolerance_px=None)  # for pairs of any two views
 
 
 @dataclass(frozen=True)
-class StepConfigs(ClassifyConfig):
+class FilterConfig:
+    """What decides about every match, and the score beside it.
+
+    The verdict is that of a score, or one of the paper's set tests on the two Delaunay graphs (Bustos et al. 2016,
+    section 3): ``adjacency`` is its Restriction 1, ``cardinality`` its Restriction 2.
+
+    A probability of at least .5 keeps a match under the verdict ``score``, unless one of ``threshold``,
+    ``target_sensitivity`` and ``min_precision`` says otherwise. The score ``topology`` is a similarity, not a
+    probability, and needs an explicit ``threshold``.
+
+    ``auto`` stands for ``learned`` under the verdict ``score`` (for ``consensus`` where its settings say that the pairs
+    are not rectified), and for no score under the verdicts of the paper, so that nobody pays for what is not asked. In
+    :class:`tensor_stereo.DelaunayFilter` it stands for ``topology`` under the verdicts of the paper.
+
+    Raises:
+        ValueError: if a value lies outside of its limits, or settings contradict each other.
+        TypeError: if a value has another type.
+    """
+
+    verdict: Verdict = "score"
+    score: ScoreName = "auto"
+    threshold: Fraction | None = None  # least score of a match that is kept
+    target_sensitivity: Fraction | None = None  # fraction of the incorrect matches that are rejected, at least
+    min_precision: Fraction | None = None  # fraction of the kept matches that are correct, at least
+    min_group_size: Annotated[int, Within(1, 2**31 - 1)] = 4  # distinct matches below which a group says nothing
+    tie_tolerance: Annotated[float, Within(0, 1, open_high=True)] = 1e-3  # in edge lengths
+    temperature: Annotated[float, Within(COLDEST, HOTTEST)] = 1.0  # of the score topology
+    temperature_unit: TemperatureUnit = "edge"
+    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)  # of the score consensus
+    backend: Backend = "auto"
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        given = [name for name in CUTS if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{given[1]} must be None beside {given[0]}, got {getattr(self, given[1])}")
+        if self.verdict != "score":
+            for name in given:
+                raise ValueError(f"{name} needs the verdict 'score', got {self.verdict!r} with {getattr(self, name)}")
+        elif self.score == "none":
+            raise ValueError("score must not be 'none' where the verdict is 'score'; name a score or another verdict")
+        elif self.score == "topology" and self.threshold is None:
+            other = f"; {given[0]} needs a probability" if given else ""
+            raise ValueError(f"threshold must be given where the score is 'topology', which is no probability{other}")
+
+    @property
+    def resolved_score(self) -> ResolvedScore:
+        """The score that is computed; what ``auto`` stands for.
+
+        >>> FilterConfig().resolved_score, FilterConfig(verdict="cardinality").resolved_score
+        ('learned', 'none')
+        """
+        if self.score != "auto":
+            return self.score
+        if self.verdict != "score":
+            return "none"
+        return "learned" if self.consensus.rectified else "consensus"
+
+    @property
+    def is_probability(self) -> bool:
+        """Whether the score is a calibrated probability."""
+        return self.resolved_score in ("consensus", "learned")
+
+
+@dataclass(frozen=True)
+class FileFilterConfig(FilterConfig):
+    """What decides about the matches of a file, whose form can choose the verdict.
+
+    ``verdict=None`` stands for ``cardinality`` in files of hloc, COLMAP and LightGlue, whose pairs need not be
+    rectified, and for ``score`` in all others.
+    """
+
+    verdict: Verdict | None = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.verdict is None:
+            check_settings(self)
+        else:
+            super().__post_init__()
+
+    def resolve(self, *, rectified: bool) -> FilterConfig:
+        """The settings for a file.
+
+        Pairs that are not rectified get a consensus score without row offsets, where ``auto`` is left to choose.
+
+        Args:
+            rectified: whether the form of the file promises rectified pairs.
+
+        Raises:
+            ValueError: if settings contradict the verdict of the file.
+
+        >>> FileFilterConfig().resolve(rectified=False).verdict
+        'cardinality'
+        """
+        settings = {f.name: getattr(self, f.name) for f in fields(FilterConfig)}
+        if self.verdict is None:
+            settings["verdict"] = "score" if rectified else "cardinality"
+        if not rectified and self.score == "auto":
+            settings["score"] = "consensus"
+        if not rectified and self.consensus == ConsensusConfig():
+            settings["consensus"] = UNRECTIFIED
+        return FilterConfig(**settings)
+
+
+def describe_verdict(settings: Mapping[str, Any]) -> str:
+    """What decides under some settings, in a few words; ``score`` is a resolved one.
+
+    >>> describe_verdict({"verdict": "adjacency"}), describe_verdict({"verdict": "score", "score": "learned"})
+    ('adjacency', 'learned, probability 0.5')
+    """
+    if settings["verdict"] != "score":
+        return str(settings["verdict"])
+    for name in CUTS:
+        if settings.get(name) is not None:
+            return f"{settings['score']}, {name.replace('_', ' ')} {settings[name]:g}"
+    return f"{settings['score']}, probability {LIKELY:g}"
+
+
+def describe_settings(config: FilterConfig) -> str:
+    """What decides under some settings, in a few words, as :func:`describe_verdict` says it of a row of results.
+
+    >>> describe_settings(FilterConfig(min_precision=0.9))
+    'learned, min precision 0.9'
+    """
+    return describe_verdict(vars(config) | {"score": config.resolved_score})
+
+
+@dataclass(frozen=True)
+class StepConfigs(FilterConfig):
     """Settings of all steps, whichever detector runs."""
 
     sift: SIFTConfig = field(default_factory=SIFTConfig)
@@ -171,24 +296,26 @@ class PipelineConfig(StepConfigs):
     detector: Detector = "fast"
     constrained: bool = False  # Restriction 3: split the matches by object first
 
+    @property
+    def resolved_matching(self) -> MatchingConfig:
+        """The matcher's settings, with the ratio of the detector's own settings where the matcher's say none.
+
+        >>> PipelineConfig(detector="sift").resolved_matching.max_ratio
+        0.8
+        """
+        if self.matching.max_ratio is None and self.detector == "sift":
+            return replace(self.matching, max_ratio=self.sift.max_ratio)
+        return self.matching
+
 
 @dataclass(frozen=True)
 class TrialConfig(PipelineConfig):
     """One point of a sweep's grid: a pipeline, and what is done to its putative matches."""
 
-    outlier_rate: float = 0.0  # fraction of the matches whose partners in view 1 change places among them
-    noise_px: float = 0.0  # standard deviation added to x and y of both keypoints
-    seed: int = 0  # of outliers and noise, together with the name of the pair
-    max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.outlier_rate <= 1:
-            raise ValueError(f"outlier_rate must lie in [0, 1], got {self.outlier_rate}")
-        if not 0 <= self.noise_px < float("inf"):
-            raise ValueError(f"noise_px must be finite and not negative, got {self.noise_px}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
+    outlier_rate: Fraction = 0.0  # of the matches whose partners in view 1 change places among them
+    noise_px: Annotated[float, Within(0, open_high=True)] = 0.0  # standard deviation added to x and y of both keypoints
+    seed: Annotated[int, Within(0, 2**31 - 1)] = 0  # of outliers and noise, together with the name of the pair
+    max_error_px: Positive = 1.0  # a match is correct iff its disparity is off by no more
 
 
 @dataclass(frozen=True)
@@ -199,53 +326,65 @@ class SweepConfig:
     export_matches: bool = False  # whether every match with its verdict is kept, for training
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if not self.trials:
             raise ValueError("trials must hold at least one point")
 
 
 @dataclass(frozen=True)
 class EvaluationConfig(StepConfigs):
-    """From pairs with ground truth to the paper's tables; ``restriction`` is the one that the tables show."""
+    """From pairs with ground truth to the paper's tables, with the verdict of the score beside them."""
 
-    min_group_size: int = 1  # 1: the paper read literally
+    min_group_size: Annotated[int, Within(1, 2**31 - 1)] = 1  # 1: the paper read literally
     detectors: tuple[Detector, ...] = DETECTORS
-    max_error_px: float = 1.0  # a match is correct iff its disparity is off by no more
+    max_error_px: Positive = 1.0  # a match is correct iff its disparity is off by no more
+
+    @property
+    def restriction(self) -> Restriction:
+        """The restriction of the paper that the tables show."""
+        return "cardinality" if self.verdict == "score" else self.verdict
 
     def trials(self, detector: Detector) -> tuple[TrialConfig, ...]:
-        """The same settings for one detector: without and with Restriction 3, under both restrictions."""
-        shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)} | {"detector": detector}
-        return tuple(
-            TrialConfig(
-                **shared | {"restriction": restriction},
-                constrained=constrained,
-                max_error_px=self.max_error_px,
+        """The same settings for one detector, under every verdict that the tables show.
+
+        The verdict of the score, if it is wanted, on all matches; then both restrictions of the paper without, and
+        last with Restriction 3.
+        """
+        shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)}
+        trial = TrialConfig(**shared, detector=detector, max_error_px=self.max_error_px)
+        trials = []
+        if trial.verdict == "score":
+            trials.append(trial)
+            trial = replace(
+                trial,
+                verdict=self.restriction,
+                score="none",
+                threshold=None,
+                target_sensitivity=None,
+                min_precision=None,
             )
-            for constrained in (False, True)
-            for restriction in RESTRICTIONS
-        )
+        for constrained in (False, True):
+            trials += [replace(trial, verdict=name, constrained=constrained) for name in RESTRICTIONS]
+        return tuple(trials)
 
 
 @dataclass(frozen=True)
 class SyntheticConfig:
     """Size and difficulty of the rendered pairs."""
 
-    width_px: int = 400
-    height_px: int = 300
-    min_disparity_px: float = 6.0  # of what is farthest, about
-    max_disparity_px: float = 60.0  # of what is nearest, about
-    noise_levels: float = 2.0  # standard deviation of the sensor noise, in grey levels, independent in both views
-    gain: float = 0.97  # of view 1
+    width_px: Count = 400
+    height_px: Count = 300
+    min_disparity_px: Positive = 6.0  # of what is farthest, about
+    max_disparity_px: Positive = 60.0  # of what is nearest, about
+    noise_levels: Annotated[float, Within(0)] = (
+        2.0  # standard deviation of the sensor noise, in grey levels, independent in both views
+    )
+    gain: Positive = 0.97  # of view 1
     offset_levels: float = 2.0  # of view 1, in grey levels
-    samples_per_px: int = 2  # rays along each axis of a pixel
+    samples_per_px: Count = 2  # rays along each axis of a pixel
 
     def __post_init__(self) -> None:
-        for name in ("width_px", "height_px", "samples_per_px"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 < self.min_disparity_px < self.max_disparity_px:
+        check_settings(self)
+        if not self.min_disparity_px < self.max_disparity_px:
             limits = f"{self.min_disparity_px} and {self.max_disparity_px}"
-            raise ValueError(f"min_disparity_px must lie between 0 and max_disparity_px, got {limits}")
-        if not self.noise_levels >= 0:
-            raise ValueError(f"noise_levels must not be negative, got {self.noise_levels}")
-        if not self.gain > 0:
-            raise ValueError(f"gain must be positive, got {self.gain}")
+            raise ValueError(f"min_disparity_px must be less than max_disparity_px, got {limits}")

@@ -11,7 +11,7 @@ from torch import Tensor
 from tensor_stereo.batching import lengths_to_ptr, select_matches
 from tensor_stereo.duplicates import coincident_ids, first_of_coincident
 from tensor_stereo.filters import FilterOutput
-from tensor_stereo.modules import DelaunayFilter
+from tensor_stereo.modules import DelaunayFilter, Images
 from tensor_stereo.ops.segments import pair_of, to_points
 from tensor_stereo.types import Matches
 
@@ -21,13 +21,14 @@ class FilteredDisparity(NamedTuple):
 
     Attributes:
         inlier: (B, 1, H', W') bool; False where there is no match, or a hidden one.
-        score: (B, 1, H', W') in [0, 1], higher is better; 0 where there is no match, or a hidden one.
+        score: (B, 1, H', W') in [0, 1], higher is better; 0 where there is no match, or a hidden one. None if the
+            filter has none.
         mask: (B, 1, H', W') bool, grid points that are matches: known, not masked out, and inside view 1.
         grid: (H', W', 2) their (x, y) in px of view 0.
     """
 
     inlier: Tensor
-    score: Tensor
+    score: Tensor | None
     mask: Tensor
     grid: Tensor
 
@@ -36,8 +37,10 @@ def filter_disparity(
     disparity: Tensor,
     stride: int,
     *,
-    filter: Callable[[Matches], FilterOutput] | None = None,  # noqa: A002
+    filter: Callable[..., FilterOutput] | None = None,  # noqa: A002
     mask: Tensor | None = None,
+    images0: Images | None = None,
+    images1: Images | None = None,
 ) -> FilteredDisparity:
     """Decide for every grid point of a disparity map whether its neighbours in the grid stay its neighbours in view 1.
 
@@ -48,12 +51,16 @@ def filter_disparity(
     is kept inside.
 
     Args:
-        disparity: (B, 1, H, W) float32 or float64, x0 - x1 in px, of any sign. NaN and infinite values are no matches,
-            nor are those whose partner lies outside columns 0..W - 1.
+        disparity: (B, 1, H, W) float32 or float64, x0 - x1 in px, of any sign; (H, W) for one map, then without these
+            axes in ``mask`` and in the result. NaN and infinite values are no matches, nor are those whose partner lies
+            outside columns 0..W - 1.
         stride: distance of the grid's points in px, at least 1. The grid starts at pixel (0, 0).
         filter: takes the matches that are not hidden, as Matches without cost, and returns a FilterOutput; None is
             ``DelaunayFilter()``.
         mask: (B, 1, H, W) bool; where it is False, disparities are no matches. None means all.
+        images0: Images of view 0, the view of the map, at which the score ``learned`` looks: (B, C, H, W), or a list of
+            (C, H, W); handed to the filter.
+        images1: Images of view 1.
 
     Returns:
         Verdicts on the grid, each map by itself. If the filter's score is differentiable, gradients flow from it to the
@@ -77,8 +84,15 @@ def filter_disparity(
         raise TypeError(f"disparity must be a tensor, got {type(disparity).__name__}")
     if disparity.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"disparity must be float32 or float64, got {disparity.dtype}")
+    if disparity.ndim == 2:
+        mask = mask[None, None] if torch.is_tensor(mask) else mask
+        result = filter_disparity(
+            disparity[None, None], stride, filter=filter, mask=mask, images0=images0, images1=images1
+        )
+        inlier, score, found = (None if values is None else values[0, 0] for values in result[:3])
+        return FilteredDisparity(inlier, score, found, result.grid)  # type: ignore[arg-type]
     if disparity.ndim != 4 or disparity.shape[1] != 1:
-        raise ValueError(f"disparity must have shape (B, 1, H, W), got {tuple(disparity.shape)}")
+        raise ValueError(f"disparity must have shape (B, 1, H, W), or (H, W) for one map, got {tuple(disparity.shape)}")
     if not isinstance(stride, int):
         raise TypeError(f"stride must be an integer number of px, got {stride!r}")
     if stride < 1:
@@ -104,11 +118,14 @@ def filter_disparity(
     keypoints1 = torch.stack([keypoints0[:, 0] - values, keypoints0[:, 1]], dim=1)
     matches = Matches(keypoints0, keypoints1, lengths_to_ptr(found.sum((1, 2))))
     nearest = _nearest_at_each_partner(matches)
-    output = (DelaunayFilter() if filter is None else filter)(select_matches(matches, nearest))
+    images = {} if images0 is None and images1 is None else {"images0": images0, "images1": images1}
+    output = (DelaunayFilter() if filter is None else filter)(select_matches(matches, nearest), **images)
     seen = torch.zeros_like(found).masked_scatter(found, nearest)
     inlier = torch.zeros_like(found).masked_scatter(seen, output.inlier)
-    score = torch.zeros_like(found, dtype=output.score.dtype).masked_scatter(seen, output.score)
-    return FilteredDisparity(inlier[:, None], score[:, None], found[:, None], grid)
+    score = None
+    if output.score is not None:
+        score = torch.zeros_like(found, dtype=output.score.dtype).masked_scatter(seen, output.score)[:, None]
+    return FilteredDisparity(inlier[:, None], score, found[:, None], grid)
 
 
 def _nearest_at_each_partner(matches: Matches) -> Tensor:

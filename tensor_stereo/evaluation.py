@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import polars as pl
 import torch
 
-from tensor_stereo.configs import Detector, EvaluationConfig, SweepConfig
+from tensor_stereo.configs import ConsensusConfig, Detector, EvaluationConfig, SweepConfig
 from tensor_stereo.metrics import IsolatedCounts, isolated_update
 from tensor_stereo.objects import isolated_matches
 from tensor_stereo.trials import STAGES, Trial, TrialRunner
@@ -28,16 +28,19 @@ ROW_SCHEMA: dict[str, Any] = {
     "min_disparity_px": pl.Float64,
     "max_disparity_px": pl.Float64,
     "variant": pl.String,  # unconstrained, or constrained: Restriction 3
-    "restriction": pl.String,
+    "verdict": pl.String,  # score, adjacency or cardinality
     "min_group_size": pl.Int32,
     "tie_tolerance": pl.Float64,
     "outlier_rate": pl.Float64,
     "noise_px": pl.Float64,
     "seed": pl.Int64,
-    "score": pl.String,
+    "score": pl.String,  # the one that was computed, or none
     "temperature": pl.Float64,  # of the score topology, else null
     "temperature_unit": pl.String,
-    "threshold": pl.Float64,  # null, as the next two: the verdict is that of the restriction
+    **{  # of the score consensus, else null
+        f"consensus_{f.name}": pl.Int32 if f.name == "num_rounds" else pl.Float64 for f in fields(ConsensusConfig)
+    },
+    "threshold": pl.Float64,  # one of these three at most, under the verdict score
     "target_sensitivity": pl.Float64,
     "min_precision": pl.Float64,
     "num_matches": pl.Int64,
@@ -62,12 +65,13 @@ ROW_SCHEMA: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class PairEvaluation:
-    """One pair, one detector, without and with Restriction 3, under both restrictions.
+    """One pair, one detector, under every verdict that the tables show.
 
     Attributes:
         pair: the images and their ground truth.
         detector: the detector of both views.
-        trials: one result per variant and restriction, the constrained ones last.
+        trials: one result per setting of :meth:`tensor_stereo.configs.EvaluationConfig.trials`, the constrained ones
+            last.
     """
 
     pair: StereoPair
@@ -116,7 +120,7 @@ def evaluate_dataset(
 def evaluate_pair(
     pair: StereoPair, detector: Detector, config: EvaluationConfig = EvaluationConfig()
 ) -> PairEvaluation:
-    """Run one detector on one pair, with and without Restriction 3, under both restrictions.
+    """Run one detector on one pair, under every verdict that the tables show.
 
     Raises:
         ValueError: if the pair has no ground truth.
@@ -134,7 +138,7 @@ def score_dataset(
     Args:
         dataset: pairs with ``disparity_gt``.
         config: the points of a sweep, as :func:`tensor_stereo.sweeps.read_grid` makes them, or the settings of the
-            paper's tables: every detector without and with Restriction 3, under both restrictions.
+            paper's tables: every detector by its score, and under both restrictions without and with Restriction 3.
 
     Returns:
         One row per pair and point, in this order, with the columns of ``ROW_SCHEMA``: the settings; ``num_matches``,
@@ -150,7 +154,7 @@ def score_dataset(
     Example:
         >>> from tensor_stereo.datasets.synthetic import SyntheticDataset
         >>> table = score_dataset(SyntheticDataset(num_pairs=1), EvaluationConfig(detectors=("fast",)))
-        >>> table.select("detector", "variant", "restriction").rows()[-1]
+        >>> table.select("detector", "variant", "verdict").rows()[-1]
         ('fast', 'constrained', 'cardinality')
     """
     if isinstance(config, SweepConfig):

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from tensor_stereo import ops
 from tensor_stereo.batching import select_matches
-from tensor_stereo.configs import RESTRICTIONS, Backend, ClassifyConfig, Restriction
+from tensor_stereo.configs import LIKELY, RESTRICTIONS, Backend, FilterConfig, Restriction
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.relations import shared_neighbors
-from tensor_stereo.scores.calibration import calibrate_consensus, keep_by_target
+from tensor_stereo.scores.calibration import keep_by_target
 from tensor_stereo.types import Classification, Matches, Relation
 
 UNTESTED = int(Relation.UNTESTED)  # a compiler takes a tensor for unequal to any member of an enumeration
@@ -54,55 +54,51 @@ def classify_matches(
         >>> ts.classify_matches(ts.Matches(left, right, torch.tensor([0, 5]))).inlier.all()
         tensor(True)
     """
-    graphs = build_match_graphs(matches, tie_tolerance=tie_tolerance, backend=backend)
-    return classify_graphs(graphs, restriction=restriction, min_group_size=min_group_size, backend=backend)
+    if restriction not in RESTRICTIONS:
+        raise ValueError(f"restriction must be one of {', '.join(RESTRICTIONS)}, got {restriction!r}")
+    config = FilterConfig(
+        verdict=restriction, min_group_size=min_group_size, tie_tolerance=tie_tolerance, backend=backend
+    )
+    return classify_graphs(build_match_graphs(matches, tie_tolerance=tie_tolerance, backend=backend), config)
 
 
-def classify_graphs(
-    graphs: MatchGraphs,
-    *,
-    restriction: Restriction = "cardinality",
-    min_group_size: int = 4,
-    backend: Backend = "auto",
-) -> Classification:
-    """The set tests of :func:`classify_matches` on graphs that exist already.
+def classify_graphs(graphs: MatchGraphs, config: FilterConfig | None = None) -> Classification:
+    """The set tests of the paper on graphs that exist already.
+
+    Args:
+        graphs: The graphs of both views of the same matches.
+        config: ``verdict``, ``min_group_size`` and ``backend`` are read; None means the defaults.
+
+    Returns:
+        As :func:`classify_matches`. Under the verdict ``score``, which :func:`apply_score` reaches, ``inlier`` is that
+        of ``cardinality``.
 
     Example:
         >>> import torch
         >>> left = torch.tensor([[0.0, 0.0], [9.0, 1.0], [1.0, 8.0]])
         >>> graphs = build_match_graphs(Matches(left, left - 2, torch.tensor([0, 3])))
-        >>> classify_graphs(graphs, min_group_size=3).relation
+        >>> classify_graphs(graphs, FilterConfig(min_group_size=3)).relation
         tensor([1, 1, 1], dtype=torch.int8)
     """
-    check_verdict(restriction, min_group_size)
-    accept_subsets = restriction == "cardinality"
-    overlap, degree0, degree1 = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=backend)
-    relation, inlier = ops.relate(overlap, degree0, degree1, graphs.group_size, min_group_size, accept_subsets, backend)
+    config = config or FilterConfig()
+    overlap, degree0, degree1 = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=config.backend)
+    accept_subsets = config.verdict != "adjacency"
+    relation, inlier = ops.relate(
+        overlap, degree0, degree1, graphs.group_size, config.min_group_size, accept_subsets, config.backend
+    )
     return Classification(inlier, relation, overlap, degree0, degree1)
 
 
-def check_verdict(restriction: str, min_group_size: int) -> None:
-    """Raise unless these are options of :func:`classify_matches`.
-
-    >>> check_verdict("cardinality", 4)
-    """
-    if min_group_size < 1:
-        raise ValueError(f"min_group_size must be at least 1, got {min_group_size}")
-    if restriction not in RESTRICTIONS:
-        raise ValueError(f"restriction must be 'adjacency' or 'cardinality', got {restriction!r}")
-
-
 def apply_score(
-    verdict: Classification, score: Tensor, ptr: Tensor, config: ClassifyConfig, *, rectified: bool = True
+    verdict: Classification, score: Tensor, ptr: Tensor, config: FilterConfig | None = None
 ) -> tuple[Classification, Tensor]:
     """Bring the set tests and the score of the same matches together.
 
     Args:
-        verdict: of M matches.
+        verdict: The set tests of M matches.
         score: (M,), the one that ``config`` names.
         ptr: (B + 1,) int64 offsets.
-        config: says whether, and at which threshold, the score decides.
-        rectified: whether the score looks at row offsets, for its calibration.
+        config: Its verdict says whether the score decides, and at which threshold; None means the defaults.
 
     Returns:
         The verdict, by the score if ``config`` wants that; and the score, 0 where the match is UNTESTED. No gradient
@@ -111,35 +107,65 @@ def apply_score(
     >>> left = torch.rand(30, 2, generator=torch.Generator().manual_seed(0)) * 100
     >>> verdict = classify_matches(Matches(left, left, torch.tensor([0, 30])))
     >>> score = torch.linspace(0, 1, 30)
-    >>> apply_score(verdict, score, torch.tensor([0, 30]), ClassifyConfig(threshold=0.5))[0].inlier.sum()
+    >>> apply_score(verdict, score, torch.tensor([0, 30]))[0].inlier.sum()
     tensor(15)
     """
+    config = config or FilterConfig()
     tested = verdict.relation != UNTESTED
     score = torch.where(tested, score, torch.zeros_like(score))
-    if not config.by_score:
+    if config.verdict != "score":
         return verdict, score
     fixed = score.detach()
-    if config.threshold is not None:
-        return replace(verdict, inlier=tested & (fixed >= config.threshold)), score
-    probability = calibrate_consensus(fixed, rectified=rectified) if config.score == "consensus" else fixed
+    if config.target_sensitivity is None and config.min_precision is None:
+        least = LIKELY if config.threshold is None else config.threshold
+        return replace(verdict, inlier=tested & (fixed >= least)), score
     targets = {"target_sensitivity": config.target_sensitivity, "min_precision": config.min_precision}
-    return replace(verdict, inlier=keep_by_target(probability, tested, ptr, **targets)), score
+    return replace(verdict, inlier=keep_by_target(fixed, tested, ptr, **targets)), score
+
+
+def verdicts_by_name(verdict: Classification, score: Tensor | None, config: FilterConfig) -> dict[str, Tensor]:
+    """The answers of every verdict to the same matches, to be shown side by side.
+
+    Args:
+        verdict: What :func:`apply_score` has returned.
+        score: (M,) likewise, or None.
+        config: The settings of both.
+
+    Returns:
+        (M,) bool for ``adjacency`` and ``cardinality``, and for ``score`` if there is a score that can decide: under
+        the verdict of the paper that is a probability, from .5 on.
+
+    >>> left = torch.tensor([[0.0, 0.0], [9.0, 1.0], [1.0, 8.0], [8.0, 9.0]])
+    >>> verdict = classify_matches(Matches(left, left, torch.tensor([0, 4])))
+    >>> list(verdicts_by_name(verdict, None, FilterConfig(verdict="cardinality")))
+    ['adjacency', 'cardinality']
+    """
+    found: dict[str, Tensor] = {name: verdict.inlier_of(name) for name in RESTRICTIONS}
+    if config.verdict == "score":
+        found["score"] = verdict.inlier
+    elif score is not None and config.is_probability:
+        found["score"] = (verdict.relation != UNTESTED) & (score >= LIKELY)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class FilterOutput:
-    """Verdicts and scores in the layout of the input: (B, N) for padded keypoints, (M,) for :class:`Matches`.
+    """Verdicts and scores in the layout of the input.
+
+    The layout is (B, N) for padded keypoints, (N,) for one pair without batch axis, and (M,) for :class:`Matches`.
 
     Attributes:
         inlier: bool; False for untested matches and in the padding.
-        score: in [0, 1], higher is better; 0 for untested matches and in the padding.
+        score: in [0, 1], higher is better; 0 for untested matches and in the padding. ``consensus`` and ``learned`` are
+            the calibrated probability of an error of at most 1 px, ``topology`` is a similarity. None if the settings
+            ask for none.
         relation: int8 values of :class:`Relation`, UNTESTED in the padding.
         matches: the M real matches of the input, as one ragged batch.
-        mask: (B, N) bool, the places of ``matches`` in the layout; None for ragged input.
+        mask: bool, the places of ``matches`` in the layout; None for ragged input.
     """
 
     inlier: Tensor
-    score: Tensor
+    score: Tensor | None
     relation: Tensor
     matches: Matches
     mask: Tensor | None = None

@@ -11,7 +11,7 @@ import torch
 from kornia.feature import match_nn
 from torch import Tensor
 
-from tensor_stereo.configs import MatchingConfig
+from tensor_stereo.configs import Backend, MatchingConfig, PipelineConfig
 from tensor_stereo.ops import gated_ssd
 from tensor_stereo.ops.gated_ssd import open_gates
 from tensor_stereo.ops.reference import NONE, pack, unpack
@@ -38,7 +38,7 @@ class MatchIndices(NamedTuple):
     ptr: Tensor
 
 
-def match_features(features0: Features, features1: Features, config: MatchingConfig | None = None) -> Matches:
+def match_features(features0: Features, features1: Features, config: PipelineConfig | None = None) -> Matches:
     """Match image b of ``features0`` with image b of ``features1``, for all b.
 
     See :func:`match_indices`, which returns the same matches as indices. Gradients flow from the matched keypoints to
@@ -47,7 +47,8 @@ def match_features(features0: Features, features1: Features, config: MatchingCon
     Args:
         features0: keypoints and descriptors of B images, view 0 (left).
         features1: those of the B partners, view 1 (right).
-        config: gates and tests; None means the defaults: the nearest neighbour, one-to-one.
+        config: gates and tests in ``config.matching``, whose ratio can come from the detector, and the back end; None
+            means the defaults: the nearest neighbour, one-to-one.
 
     Returns:
         One-to-one matches in the order of the keypoints of view 0, with their SSD as ``cost``.
@@ -68,7 +69,7 @@ def match_features(features0: Features, features1: Features, config: MatchingCon
 
 
 @torch.no_grad()
-def match_indices(features0: Features, features1: Features, config: MatchingConfig | None = None) -> MatchIndices:
+def match_indices(features0: Features, features1: Features, config: PipelineConfig | None = None) -> MatchIndices:
     """Nearest neighbours of the keypoints of view 0 among those of view 1, for every pair of a ragged batch.
 
     In this order:
@@ -94,50 +95,32 @@ def match_indices(features0: Features, features1: Features, config: MatchingConf
     Args:
         features0: keypoints and descriptors of B images, view 0 (left).
         features1: those of the B partners, view 1 (right).
-        config: gates and tests; None means the defaults: the nearest neighbour, one-to-one.
+        config: gates and tests in ``config.matching``, whose ratio can come from the detector, and the back end; None
+            means the defaults: the nearest neighbour, one-to-one.
 
     Returns:
         Rows of both features and the cost of each match. Images without keypoints have no match.
 
     Raises:
-        ValueError: if the features differ in the number of images or in descriptor length, hold values that are not
-            finite (descriptors; with gates, keypoints beyond 2**24 px), or a setting does not fit.
+        ValueError: if the features differ in the number of images or in descriptor length, or hold values that are not
+            finite (descriptors; with gates, keypoints beyond 2**24 px).
 
     >>> ptr = torch.tensor([0, 2])
     >>> features = Features(torch.zeros(2, 2), ptr, torch.tensor([[3.0], [5.0]]), torch.ones(2))
     >>> match_indices(features, features).index1
     tensor([0, 1])
     """
-    config = config or MatchingConfig()
-    check_config(config)
+    config = config or PipelineConfig()
+    matching = config.resolved_matching
     features0, features1 = (replace(f, descriptors=f.descriptors.float()) for f in (features0, features1))
     peak = _check_features(features0, features1)
-    best = _Best.empty(features0, features1, ratio=config.max_ratio is not None, mutual=config.mutual)
-    if any(_is_gate(g) for g in (config.max_row_offset_px, config.min_disparity_px, config.max_disparity_px)):
-        best.take(*_gated_search(features0, features1, config))
+    best = _Best.empty(features0, features1, ratio=matching.max_ratio is not None, mutual=matching.mutual)
+    if any(_is_gate(g) for g in (matching.max_row_offset_px, matching.min_disparity_px, matching.max_disparity_px)):
+        best.take(*_gated_search(features0, features1, matching, config.backend))
     else:
         _search_dense(features0, features1, best, peak)
-    index0, index1, cost = best.select(config.max_ratio)
+    index0, index1, cost = best.select(matching.max_ratio)
     return MatchIndices(index0, index1, cost, torch.searchsorted(index0, features0.ptr))
-
-
-def check_config(config: MatchingConfig) -> None:
-    """Raise unless the settings fit.
-
-    >>> check_config(MatchingConfig(max_ratio=0.8))
-    """
-    ratio, rows = config.max_ratio, config.max_row_offset_px
-    low, high = config.min_disparity_px, config.max_disparity_px
-    if ratio is not None and not 0 < ratio <= 1:
-        raise ValueError(f"MatchingConfig.max_ratio must lie in (0, 1] or be None, got {ratio}")
-    if rows is not None and not rows >= 0:
-        raise ValueError(f"MatchingConfig.max_row_offset_px must be at least 0 or None, got {rows}")
-    if low is not None and not low < math.inf:
-        raise ValueError(f"MatchingConfig.min_disparity_px must be a number below infinity or None, got {low}")
-    if high is not None and not high > -math.inf:
-        raise ValueError(f"MatchingConfig.max_disparity_px must be a number above -infinity or None, got {high}")
-    if low is not None and high is not None and low > high:
-        raise ValueError(f"MatchingConfig.min_disparity_px must be at most max_disparity_px, got {low} > {high}")
 
 
 def _check_features(features0: Features, features1: Features) -> float:
@@ -155,12 +138,14 @@ def _check_features(features0: Features, features1: Features) -> float:
     return max(peaks)
 
 
-def _gated_search(features0: Features, features1: Features, config: MatchingConfig) -> tuple[Tensor, ...]:
+def _gated_search(
+    features0: Features, features1: Features, matching: MatchingConfig, backend: Backend
+) -> tuple[Tensor, ...]:
     arguments = ((f.keypoints, f.descriptors, f.ptr) for f in (features0, features1))
     (keypoints0, descriptors0, ptr0), (keypoints1, descriptors1, ptr1) = arguments
-    gates = open_gates(config)
+    gates = open_gates(matching)
     found: tuple[Tensor, ...] = gated_ssd(
-        keypoints0, keypoints1, descriptors0, descriptors1, ptr0, ptr1, *gates, "auto"
+        keypoints0, keypoints1, descriptors0, descriptors1, ptr0, ptr1, *gates, backend
     )
     return found
 

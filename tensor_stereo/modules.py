@@ -2,117 +2,162 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tensor_stereo.batching import from_padded
-from tensor_stereo.configs import SCORES, Backend, ClassifyConfig, ConsensusConfig, Restriction, Score, TemperatureUnit
-from tensor_stereo.filters import FilterOutput, apply_score, check_verdict, classify_graphs
-from tensor_stereo.ops.segments import check_options
-from tensor_stereo.scores.consensus import check_consensus
+from tensor_stereo.batching import from_padded, lengths_to_ptr
+from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FilterConfig
+from tensor_stereo.features import list_images
+from tensor_stereo.filters import FilterOutput, apply_score, classify_graphs
+from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.evidence import ImageEvidence
+from tensor_stereo.scores.learned import LearnedScore, load_learned
 from tensor_stereo.scores.scoring import score_matches
-from tensor_stereo.soft import COLDEST, HOTTEST, check_temperature
-from tensor_stereo.types import Matches, check_unit
+from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
+
+Images = Tensor | Sequence[Tensor]
+_RENAMED = {"restriction": "verdict", "unit": "temperature_unit"}
 
 
 class DelaunayFilter(nn.Module):
-    """:func:`tensor_stereo.classify_matches` with a score, for training loops.
+    """Decides which putative matches are right, and scores them with gradients.
+
+    By default a match is kept if its calibrated probability of being right, the score ``learned``, is at least .5. The
+    set tests of the paper, :func:`tensor_stereo.classify_matches`, are the verdicts ``adjacency`` and ``cardinality``;
+    their result, ``relation``, is always returned.
 
     Args:
-        restriction: of the verdict, as in :func:`tensor_stereo.classify_matches`.
-        score: ``consensus``, how far the believed neighbours of a match predict its displacement
-            (:func:`tensor_stereo.scores.consensus.consensus_score`); ``learned``, the calibrated probability of a small
-            network (:func:`tensor_stereo.scores.learned.score_learned`), best with the evidence of the images;
-            ``topology``, how far both neighbour sets agree: their soft Jaccard index, 1 iff Restriction 1 holds.
-        consensus: settings of that score; None means the defaults, for rectified pairs.
-        temperature: of ``topology``: below which dual Voronoi edges are hardly told from ties.
-        temperature_unit: ``edge``: in lengths of the edge at hand, so that the score does not depend on scale; ``px``:
-            in pixels.
-        learnable_temperature: whether the temperature is a parameter (its logarithm is what is learnt); for
-            ``topology``.
-        threshold: verdict by score >= threshold instead of by ``restriction``.
-        target_sensitivity: verdict by the score: as many matches of a pair are kept as let expect that this fraction of
-            the incorrect ones is rejected. For ``consensus`` and ``learned``, which are calibrated.
-        min_precision: verdict by the score: as many are kept as let expect that this fraction of the kept ones is
-            correct (the paper's negative predictive value). For ``consensus`` and ``learned``.
-        straight_through: the score is the verdict, with the gradient of the soft score.
-        min_group_size: as in :func:`tensor_stereo.classify_matches`.
-        tie_tolerance: as in :func:`tensor_stereo.classify_matches`.
-        backend: as in :func:`tensor_stereo.classify_matches`.
+        config: The settings; None means the defaults.
+        straight_through: Whether the score is the verdict, with the gradient of the soft score.
+        learnable_temperature: Whether the temperature of ``topology`` is a parameter; its logarithm is what is learnt.
+        trainable: Whether the weights of ``learned`` have gradients. They are parameters, and frozen unless this is
+            set.
+        **settings: Fields of :class:`tensor_stereo.FilterConfig` that replace those of ``config``:
+
+            ``verdict``: ``score``, or ``adjacency`` or ``cardinality``, the paper's Restrictions 1 and 2.
+            ``score``: ``learned``, the calibrated probability of a small network
+            (:func:`tensor_stereo.scores.learned.score_learned`), best with the images; ``consensus``, the calibrated
+            probability that follows from how far the believed neighbours of a match predict its displacement
+            (:func:`tensor_stereo.scores.consensus.consensus_score`); ``topology``, how far both neighbour sets agree:
+            their soft Jaccard index, a similarity, 1 iff Restriction 1 holds; ``auto``, ``learned`` under the verdict
+            ``score`` and ``topology`` under the others; ``none`` under the others only.
+            ``threshold``: The least score of a match that is kept, in place of .5.
+            ``min_precision``: The verdict keeps the largest set of matches of a pair whose expected precision is at
+            least this value (precision is the paper's negative predictive value).
+            ``target_sensitivity``: The verdict keeps the largest set of matches of a pair that is expected to leave out
+            this fraction of the incorrect ones.
+            ``min_group_size``, ``tie_tolerance``, ``backend``: As in :func:`tensor_stereo.classify_matches`.
+            ``consensus``: Settings of that score; ``UNRECTIFIED`` is for pairs that are not rectified.
+            ``temperature``: Of ``topology``; dual Voronoi edges much shorter than this are hardly told from ties.
+            ``temperature_unit``: ``edge``, in lengths of the edge at hand, so that the score does not depend on scale;
+            or ``px``.
 
     Raises:
-        ValueError: for an unknown option, or a temperature outside 1e-9..1e9.
+        TypeError: for a setting that does not exist.
+        ValueError: for a value outside of its limits, or settings that contradict each other.
 
-    Source: the verdict is Bustos, Vargas & Trujillo, CIARP 2016, section 3; the score is this library's.
+    The state dictionary holds the weights and a fingerprint of the settings that define the score; the state of another
+    score is refused. ``torch.compile(fullgraph=True)`` works for ``topology`` and ``consensus``. It does not for
+    ``learned``, whose links between matches are as many as the data say: compile the rest of the model around it, with
+    a graph break here.
+
+    Source: the set tests are those of Bustos, Vargas & Trujillo, CIARP 2016, section 3; the scores are this library's.
 
     Example:
-        >>> left = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(0)) * 100
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> left = torch.rand(2, 300, 2, generator=generator) * 300
         >>> right = left - torch.tensor([5.0, 0.0])
+        >>> right[:, :90] = torch.rand(2, 90, 2, generator=generator) * 300  # wrong matches
         >>> output = DelaunayFilter()(left, right)
-        >>> output.inlier.all(), output.score.min() > 0.7
-        (tensor(True), tensor(True))
+        >>> output.inlier[:, :90].sum(), output.inlier[:, 90:].sum()
+        (tensor(0), tensor(420))
     """
 
     log_temperature: Tensor
 
     def __init__(
         self,
+        config: FilterConfig | None = None,
         *,
-        restriction: Restriction = "cardinality",
-        score: Score = "consensus",
-        consensus: ConsensusConfig | None = None,
-        temperature: float = 1.0,
-        temperature_unit: TemperatureUnit = "edge",
-        learnable_temperature: bool = False,
-        threshold: float | None = None,
-        target_sensitivity: float | None = None,
-        min_precision: float | None = None,
         straight_through: bool = False,
-        min_group_size: int = 4,
-        tie_tolerance: float = 1e-3,
-        backend: Backend = "auto",
+        learnable_temperature: bool = False,
+        trainable: bool = False,
+        **settings: Any,
     ) -> None:
         super().__init__()
-        check_verdict(restriction, min_group_size)
-        if score not in SCORES:
-            raise ValueError(f"score must be one of {', '.join(SCORES)}, got {score!r}")
-        if learnable_temperature and score != "topology":
-            raise ValueError(f"learnable_temperature must be False where score is {score!r}, which has no temperature")
-        check_unit(temperature_unit, "temperature_unit")
-        check_temperature(temperature)
-        check_options(tie_tolerance, backend)
-        self.score: Score = score
-        self.consensus = ConsensusConfig() if consensus is None else consensus
-        check_consensus(self.consensus)
+        config = _merge(FilterConfig() if config is None else config, settings)
+        if config.score == "auto" and config.verdict != "score":
+            config = replace(config, score="topology")  # its soft counterpart, whose gradient is asked for
+        self.config = config
+        score = config.resolved_score
+        for name, given, needed in (
+            ("learnable_temperature", learnable_temperature, ("topology",)),
+            ("trainable", trainable, ("learned",)),
+            ("straight_through", straight_through, ("topology", "consensus", "learned")),
+        ):
+            if given and score not in needed:
+                raise ValueError(f"{name} must be False where the score is {score!r}")
         self.straight_through = straight_through
-        self.config = ClassifyConfig(
-            restriction=restriction,
-            min_group_size=min_group_size,
-            tie_tolerance=tie_tolerance,
-            backend=backend,
-            score=score,
-            temperature=temperature,
-            temperature_unit=temperature_unit,
-            threshold=threshold,
-            target_sensitivity=target_sensitivity,
-            min_precision=min_precision,
-        )
-        logarithm = torch.tensor(temperature, dtype=torch.float64).log()
+        logarithm = torch.tensor(config.temperature, dtype=torch.float64).log()
         if learnable_temperature:
             self.log_temperature = nn.Parameter(logarithm)
         else:
             self.register_buffer("log_temperature", logarithm)
+        self.network: LearnedScore | None = None
+        if score == "learned":
+            self.network = copy.deepcopy(load_learned()).requires_grad_(trainable)
 
     @property
     def temperature(self) -> Tensor:
         """() float64, in ``temperature_unit``, whatever the dtype that the module is moved to."""
         return self.log_temperature.exp().clamp(COLDEST, HOTTEST)
 
+    def extra_repr(self) -> str:
+        """The settings, in one line."""
+        settings = {f.name: getattr(self.config, f.name) for f in fields(FilterConfig)}
+        settings["score"] = self.config.resolved_score
+        if settings["consensus"] == ConsensusConfig() or settings["score"] != "consensus":
+            del settings["consensus"]
+        if settings["score"] != "topology":
+            del settings["temperature"], settings["temperature_unit"]
+        shown = [f"{name}={value!r}" for name, value in settings.items() if value is not None]
+        return ", ".join([*shown, *(["straight_through=True"] if self.straight_through else [])])
+
+    def get_extra_state(self) -> Tensor:
+        """The settings that define the score, as the bytes of a JSON text, for ``state_dict``."""
+        text = json.dumps(self._fingerprint(), sort_keys=True)
+        return torch.tensor(list(text.encode()), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse the state of another score.
+
+        Raises:
+            ValueError: naming the setting that differs.
+        """
+        known, mine = json.loads(bytes(state.tolist())), self._fingerprint()
+        for name in sorted(known.keys() | mine.keys(), key=lambda name: (name != "score", name)):
+            if known.get(name) != mine.get(name):
+                given = f"{known.get(name)!r}, but this filter has {mine.get(name)!r}"
+                raise ValueError(f"state_dict is that of a DelaunayFilter with {name}={given}")
+
+    def _fingerprint(self) -> dict[str, Any]:
+        config = self.config
+        score = config.resolved_score
+        settings: dict[str, Any] = {"score": score, "tie_tolerance": config.tie_tolerance}
+        if score == "topology":
+            settings["temperature_unit"] = config.temperature_unit
+        if score == "consensus":
+            settings["consensus"] = asdict(config.consensus)
+        return settings
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DelaunayFilter:
-        """Follow a move to another device, but not one to another dtype: the score is computed in float64."""
+        """Follow a move to another device, but not one to another dtype: each score has its own precision."""
         super()._apply(lambda tensor: tensor.to(fn(tensor).device), recurse)  # type: ignore[no-untyped-call]
         return self
 
@@ -124,18 +169,24 @@ class DelaunayFilter(nn.Module):
         group: Tensor | None = None,
         cost: Tensor | None = None,
         *,
+        images0: Images | None = None,
+        images1: Images | None = None,
         evidence: ImageEvidence | None = None,
     ) -> FilterOutput:
-        """Classify and score padded pairs, or a ragged batch given as the only argument.
+        """Classify and score padded pairs, one pair, or a ragged batch given as the only argument.
 
         Args:
-            keypoints0: (B, N, 2) float32 or float64 px of view 0, or :class:`Matches`. Pairs need not be rectified.
+            keypoints0: (B, N, 2) float32 or float64 px of view 0; (N, 2) for one pair, then without batch axis in all
+                other arguments and in the result; or :class:`Matches`.
             keypoints1: (B, N, 2) px of view 1; row i of both is one match.
             mask: (B, N) bool, True for real matches; None means all. The padding may hold anything.
             group: (B, N) integer object groups.
             cost: (B, N), lower is better; decides between duplicates, and is evidence for consensus and learned.
-            evidence: what the images say of the rows of ``Matches``, for learned:
-                :func:`tensor_stereo.scores.evidence.measure_images`.
+            images0: Images of view 0, at which ``learned`` looks: (B, C, H, W), or a list of B images (C, H, W) of any
+                sizes; uint8 or floating point in [0, 1], C = 1 or 3 (RGB). The keypoints are px of these images.
+            images1: Images of view 1.
+            evidence: What :func:`tensor_stereo.scores.evidence.measure_images` has measured before for the rows of
+                ``Matches``, in place of the images.
 
         Returns:
             ``inlier``, ``score`` and ``relation`` in the layout of the input. The score has the dtype of the keypoints,
@@ -143,70 +194,108 @@ class DelaunayFilter(nn.Module):
             consensus the cost), and are zero for untested matches; topology is not differentiable twice.
 
         Raises:
-            ValueError: if shapes disagree, or as :func:`tensor_stereo.classify_matches`.
-            TypeError: for keypoints in half precision, which cannot tell pixels apart beyond 256; for arguments beside
-                ``Matches``.
+            ValueError: if shapes disagree, coordinates are NaN, infinite or out of range, or costs are NaN.
+            TypeError: for values that are no tensors of the right dtype; for arguments beside ``Matches``; for images
+                beside a score that looks at none.
+
+        Warns:
+            DomainWarning: if the keypoints are no pixels of rectified pairs, as ``learned`` and ``consensus`` expect.
         """
         if isinstance(keypoints0, Matches):
             rest = {"keypoints1": keypoints1, "mask": mask, "group": group, "cost": cost}
             for name in (name for name, value in rest.items() if value is not None):
                 raise TypeError(f"{name} must be part of the Matches, not given beside them")
-            return FilterOutput(*self._classify(keypoints0, evidence), keypoints0)
+            return self._decide(keypoints0, images0, images1, evidence)
         if evidence is not None:
             raise TypeError("evidence must be that of Matches, got padded keypoints")
-        mask = _check_padded(keypoints0, keypoints1, mask, group, cost)
-        rows0, ptr = from_padded(keypoints0, mask)
-        rows1, cost, group = (None if v is None else from_padded(v, mask)[0] for v in (keypoints1, cost, group))
-        matches = Matches(rows0, rows1, ptr, cost, group)  # type: ignore[arg-type]
-        inlier, score, relation = (_spread(rows, mask) for rows in self._classify(matches))
-        return FilterOutput(inlier, score, relation, matches, mask)
-
-    def _classify(self, matches: Matches, evidence: ImageEvidence | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """inlier, score and relation of every match."""
-        config = self.config
-        score, graphs = score_matches(
-            matches,
-            score=self.score,
-            consensus=self.consensus,
-            temperature=self.temperature,
-            temperature_unit=config.temperature_unit,
-            evidence=evidence,
-            tie_tolerance=config.tie_tolerance,
-            backend=config.backend,
+        if keypoints1 is None:
+            raise ValueError("keypoints1 must be given with keypoints0")
+        tensors = {"keypoints0": keypoints0, "keypoints1": keypoints1, "mask": mask, "group": group, "cost": cost}
+        for name, value in tensors.items():
+            if value is not None:
+                check_tensor(name, value)
+        single = keypoints0.ndim == 2
+        if single:
+            tensors = {name: None if value is None else value[None] for name, value in tensors.items()}
+        mask = _check_padded(tensors, single=single)
+        rows = {name: None if v is None else from_padded(v, mask)[0] for name, v in tensors.items() if name != "mask"}
+        ptr = lengths_to_ptr(mask.sum(1))
+        matches = Matches(rows["keypoints0"], rows["keypoints1"], ptr, rows["cost"], rows["group"])  # type: ignore[arg-type]
+        output = self._decide(matches, images0, images1, None)
+        inlier, score, relation = (
+            None if values is None else _spread(values, mask)
+            for values in (output.inlier, output.score, output.relation)
         )
-        verdict = classify_graphs(
-            graphs, restriction=config.restriction, min_group_size=config.min_group_size, backend=config.backend
+        if single:
+            inlier, score, relation, mask = (None if v is None else v[0] for v in (inlier, score, relation, mask))
+        return FilterOutput(inlier, score, relation, matches, mask)  # type: ignore[arg-type]
+
+    def _decide(
+        self, matches: Matches, images0: Images | None, images1: Images | None, evidence: ImageEvidence | None
+    ) -> FilterOutput:
+        """Verdict, score and relation of every match."""
+        config = self.config
+        images = _both_views(images0, images1, matches.num_pairs)
+        if config.resolved_score == "none":
+            for name, value in (("images0", images), ("evidence", evidence)):
+                if value is not None:
+                    raise TypeError(f"{name} must be None where there is no score")
+            graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
+            verdict = classify_graphs(graphs, config)
+            return FilterOutput(verdict.inlier, None, verdict.relation, matches)
+        score, graphs = score_matches(
+            matches, config, images=images, evidence=evidence, temperature=self.temperature, network=self.network
         )
         device = matches.keypoints0.device.type
         low = torch.is_autocast_enabled(device)
         score = score.to(torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype)
-        rectified = self.consensus.row_tolerance_px is not None
-        verdict, score = apply_score(verdict, score, matches.ptr, config, rectified=rectified)
+        verdict, score = apply_score(classify_graphs(graphs, config), score, matches.ptr, config)
         if self.straight_through:
             score = score + (verdict.inlier.to(score.dtype) - score).detach()
-        return verdict.inlier, score, verdict.relation
+        return FilterOutput(verdict.inlier, score, verdict.relation, matches)
 
 
-def _check_padded(
-    keypoints0: Tensor, keypoints1: Tensor | None, mask: Tensor | None, group: Tensor | None, cost: Tensor | None
-) -> Tensor:
-    """The mask; raises unless all shapes fit."""
-    if keypoints1 is None:
-        raise ValueError("keypoints1 must be given with keypoints0")
-    for name, given in (("keypoints0", keypoints0), ("keypoints1", keypoints1)):
-        if not torch.is_tensor(given):
-            raise TypeError(f"{name} must be a tensor, got {type(given).__name__}")
-    if keypoints0.ndim != 3 or keypoints0.shape[2] != 2:
-        raise ValueError(f"keypoints0 must have shape (B, N, 2), got {tuple(keypoints0.shape)}")
-    for name, value, shape in (
-        ("keypoints1", keypoints1, keypoints0.shape),
-        ("mask", mask, keypoints0.shape[:2]),
-        ("group", group, keypoints0.shape[:2]),
-        ("cost", cost, keypoints0.shape[:2]),
-    ):
+def _merge(config: FilterConfig, settings: dict[str, Any]) -> FilterConfig:
+    """The same settings with others in their place; raises for names that are none."""
+    names = [f.name for f in fields(FilterConfig)]
+    for name in settings:
+        if name in _RENAMED:
+            raise TypeError(f"DelaunayFilter has no setting {name!r}; it is {_RENAMED[name]!r} now")
+        if name not in names:
+            raise TypeError(f"DelaunayFilter has no setting {name!r}; known are {', '.join(names)}")
+    if settings.get("consensus", config) is None:
+        settings = settings | {"consensus": ConsensusConfig()}
+    return replace(config, **settings)
+
+
+def _both_views(
+    images0: Images | None, images1: Images | None, num_pairs: int
+) -> tuple[list[Tensor], list[Tensor]] | None:
+    if images0 is None and images1 is None:
+        return None
+    for name, images in (("images0", images0), ("images1", images1)):
+        if images is None:
+            raise ValueError(f"{name} must be given, as the other view has images")
+    return list_images("images0", images0, num_pairs), list_images("images1", images1, num_pairs)  # type: ignore[arg-type]
+
+
+def _check_padded(tensors: dict[str, Tensor | None], *, single: bool) -> Tensor:
+    """The mask (B, N); raises unless all shapes fit, of which those of one pair have no batch axis yet."""
+    keypoints0, mask = tensors["keypoints0"], tensors["mask"]
+    if keypoints0 is None or keypoints0.ndim != 3 or keypoints0.shape[2] != 2:
+        given = None if keypoints0 is None else tuple(keypoints0.shape[int(single) :])
+        raise ValueError(f"keypoints0 must have shape (B, N, 2), or (N, 2) for one pair, got {given}")
+    for name, value in tensors.items():
+        shape = keypoints0.shape if name.startswith("keypoints") else keypoints0.shape[:2]
         if value is not None and value.shape != shape:
-            raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(value.shape)}")
-    return torch.ones(keypoints0.shape[:2], dtype=torch.bool, device=keypoints0.device) if mask is None else mask
+            expected, given = (tuple(size[1:] if single else size) for size in (shape, value.shape))
+            raise ValueError(f"{name} must have shape {expected}, got {given}")
+        if value is not None and name.startswith("keypoints"):
+            check_pixels(name, value)
+    if mask is None:
+        return torch.ones(keypoints0.shape[:2], dtype=torch.bool, device=keypoints0.device)
+    check_mask("mask", mask)
+    return mask
 
 
 def _spread(rows: Tensor, mask: Tensor) -> Tensor:

@@ -87,11 +87,9 @@ def contour_images(images: Tensor, config: ObjectsConfig = _DEFAULT_CONFIG) -> T
         >>> contour_images(image).sum()  # too small for the element: closing keeps the dot, opening removes it
         tensor(1)
     """
-    if config.element_px < 1 or config.element_px % 2 == 0:
-        raise ValueError(f"element_px must be odd and at least 1, got {config.element_px}")
     binary = (images > otsu_threshold(images).view(-1, 1, 1, 1)).float()
     # a square is a row after a column: 2 k instead of k * k shifts, the same values
-    row = torch.ones(1, config.element_px, device=images.device)
+    row = torch.ones(1, config.element_px, dtype=torch.float32, device=images.device)
     column = row.T
     closed = erosion(erosion(dilation(dilation(binary, row), column), row), column)
     opened = dilation(dilation(erosion(erosion(binary, row), column), row), column)
@@ -305,8 +303,6 @@ def sample_nearest(
 
 def _trace(outline: Tensor, config: ObjectsConfig) -> list[NDArray[np.int32]]:
     """Contours (L, 1, 2) of at least the least area in a (H, W) boolean image, in the order of their labels."""
-    if not config.min_area_px >= 0:
-        raise ValueError(f"min_area_px must not be negative, got {config.min_area_px}")
     image = outline.to("cpu", torch.uint8).numpy()
     contours, _ = cv2.findContours(image, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     areas = [cv2.contourArea(contour) for contour in contours]

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
-from tensor_stereo.configs import MatchingConfig, PipelineConfig
+from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.filters import apply_score, classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
-from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.scoring import score_matches
 from tensor_stereo.types import Classification, Features, Matches
 
@@ -48,7 +47,8 @@ class PipelineOutput:
         matches: the putative matches of all pairs, with ``group`` if the run was constrained.
         graphs: their Delaunay graphs.
         classification: one verdict per match.
-        score: (M,), higher is better, 0 for untested matches; None if the settings ask for none.
+        score: (M,), higher is better, 0 for untested matches; None if the settings ask for none. ``learned``, the
+            default, and ``consensus`` are the calibrated probability of an error of at most 1 px.
         seconds: wall time of each stage for the whole batch.
     """
 
@@ -77,8 +77,9 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         >>> from tensor_stereo.datasets.synthetic import render_pair
         >>> pair = render_pair(0)
         >>> output = run_pipeline([(pair.image0, pair.image1)])
-        >>> len(output.classification.inlier) == output.matches.num_matches
-        True
+        >>> kept = output.classification.inlier
+        >>> bool(output.score[kept].min() >= 0.5), bool(kept.sum() > 300)
+        (True, True)
     """
     watch = Stopwatch()
     gray = to_gray_pairs(pairs)
@@ -88,7 +89,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
     with watch.measure("graph"):
         graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
     with watch.measure("relate"):
-        verdicts = classify_graphs(graphs, restriction=config.restriction, min_group_size=config.min_group_size)
+        verdicts = classify_graphs(graphs, config)
     with watch.measure("score"):
         score = score_pairs(gray, matches, graphs, config)
         if score is not None:
@@ -116,7 +117,7 @@ def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwa
     with watch.measure("detect"):
         features0, features1 = detect_pairs(gray, config)
     with watch.measure("match"):
-        return match_features(features0, features1, matching_settings(config))
+        return match_features(features0, features1, config)
 
 
 def detect_pairs(gray: Sequence[ImagePair], config: PipelineConfig) -> tuple[Features, Features]:
@@ -124,13 +125,6 @@ def detect_pairs(gray: Sequence[ImagePair], config: PipelineConfig) -> tuple[Fea
     found = detect_images([pair[view] for view in (0, 1) for pair in gray], config)
     features0, features1 = (concatenate_features(part) for part in (found[: len(gray)], found[len(gray) :]))
     return features0, features1
-
-
-def matching_settings(config: PipelineConfig) -> MatchingConfig:
-    """The matcher's settings, with the ratio that the detector's own settings say where the matcher's say none."""
-    if config.matching.max_ratio is None and config.detector == "sift":
-        return replace(config.matching, max_ratio=config.sift.max_ratio)
-    return config.matching
 
 
 def detect_images(images: Sequence[Tensor], config: PipelineConfig) -> list[Features]:
@@ -164,17 +158,9 @@ def score_pairs(
         graphs: of these matches.
         config: names the score; ``none`` gives None.
     """
-    if config.score == "none":
+    if config.resolved_score == "none":
         return None
     images0, images1 = ([pair[view][0] for pair in gray] for view in (0, 1))
-    score, _ = score_matches(
-        matches,
-        graphs,
-        score=config.score,
-        temperature=config.temperature,
-        temperature_unit=config.temperature_unit,
-        evidence=measure_images(images0, images1, matches, graphs) if config.score == "learned" else None,
-        tie_tolerance=config.tie_tolerance,
-        backend=config.backend,
-    )
+    images = (images0, images1) if config.resolved_score == "learned" else None
+    score, _ = score_matches(matches, config, graphs, images=images)
     return score.to(matches.keypoints0.dtype)

@@ -15,13 +15,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from tensor_stereo import ops
-from tensor_stereo.configs import Backend, TemperatureUnit
+from tensor_stereo.configs import COLDEST, HOTTEST, Backend, TemperatureUnit
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.types import Adjacency, Matches, check_pairs, check_points, check_tie_tolerance, check_unit
 
 SATURATION = 40.0  # |length / temperature| beyond which an adjacency is constant
 REACH = 16.0  # temperatures of negative length below which a pair counts as blocked; its adjacency is below 1.2e-7
-COLDEST, HOTTEST = 1e-9, 1e9  # temperatures
 _TIE = 1e-9  # adjacencies closer than that share the gradient of their minimum
 _UNBOUNDED = 2.0**30  # edge lengths to which dual edges are clipped where the tolerance does not
 

@@ -17,7 +17,7 @@ from tensor_stereo.matching import match_features
 from tensor_stereo.metrics import confusion_update, matches_against_gt, roc_update
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.perturbation import add_noise, inject_outliers
-from tensor_stereo.pipeline import Stopwatch, detect_pairs, matching_settings, score_pairs, to_gray_pairs
+from tensor_stereo.pipeline import Stopwatch, detect_pairs, score_pairs, to_gray_pairs
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
 STAGES = ("detect", "match", "perturb", "group", "graph", "relate", "score")
@@ -38,7 +38,7 @@ class Trial:
         correct: (M,) bool, the disparity is right.
         valid: (M,) bool, ground truth is known; all False for a pair without.
         graphs: the Delaunay graphs of both views.
-        classification: the set tests; ``inlier`` follows the score, if the setting wants that.
+        classification: the set tests; ``inlier`` follows the verdict that the setting names.
         score: (M,), higher is better; None if the setting asks for none.
         seconds: wall time of each of ``STAGES``, also where it was shared with other trials.
     """
@@ -57,28 +57,32 @@ class Trial:
         """One record, whose fields :func:`tensor_stereo.score_dataset` documents."""
         config, features = self.config, getattr(self.config, self.config.detector)
         confusion = confusion_update(self.classification.inlier, self.correct, self.valid)
-        rates = confusion.rates()
+        rates, score = confusion.rates(), config.resolved_score
         return {
             "dataset": self.pair.dataset,
             "scene": scene_name(self.pair),
             "detector": config.detector,
             "feature_backend": getattr(features, "backend", None),
             "window_px": getattr(features, "window_px", None),
-            "max_ratio": matching_settings(config).max_ratio,
+            "max_ratio": config.resolved_matching.max_ratio,
             "mutual": config.matching.mutual,
             "max_row_offset_px": config.matching.max_row_offset_px,
             "min_disparity_px": config.matching.min_disparity_px,
             "max_disparity_px": config.matching.max_disparity_px,
             "variant": "constrained" if config.constrained else "unconstrained",
-            "restriction": config.restriction,
+            "verdict": config.verdict,
             "min_group_size": config.min_group_size,
             "tie_tolerance": config.tie_tolerance,
             "outlier_rate": config.outlier_rate,
             "noise_px": config.noise_px,
             "seed": config.seed,
-            "score": config.score,
-            "temperature": config.temperature if config.score == "topology" else None,
-            "temperature_unit": config.temperature_unit if config.score == "topology" else None,
+            "score": score,
+            "temperature": config.temperature if score == "topology" else None,
+            "temperature_unit": config.temperature_unit if score == "topology" else None,
+            **{
+                f"consensus_{name}": value if score == "consensus" else None
+                for name, value in vars(config.consensus).items()
+            },
             **{name: getattr(config, name) for name in CUTS},
             "num_matches": self.matches.num_matches,
             "num_valid": confusion.num_valid,
@@ -118,23 +122,26 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
     """What the result of each stage depends on; trials with equal keys share it.
 
     >>> trial = TrialConfig()
-    >>> keys, other = stage_keys(trial), stage_keys(replace(trial, restriction="adjacency"))
+    >>> keys, other = stage_keys(trial), stage_keys(replace(trial, verdict="adjacency"))
     >>> [stage for stage in STAGES if keys[stage] != other[stage]]
-    ['relate']
+    ['relate', 'score']
     """
     features = getattr(trial, trial.detector)
     if trial.detector == "sift":
         features = replace(features, max_ratio=None)  # a setting of the matcher
     keys: dict[str, Hashable] = {"detect": (trial.detector, features)}
-    keys["match"] = keys["detect"], matching_settings(trial)
+    keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
     keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed, trial.max_error_px
     if trial.constrained:
         keys["label"] = trial.objects  # of the images alone
     keys["group"] = keys["perturb"], trial.objects if trial.constrained else None
     keys["graph"] = keys["group"], trial.tie_tolerance, trial.backend
-    keys["relate"] = keys["graph"], trial.restriction, trial.min_group_size
-    measure = (trial.score, trial.temperature, trial.temperature_unit)
-    keys["score"] = keys["graph"], None if trial.score == "none" else measure
+    keys["relate"] = keys["graph"], trial.verdict == "adjacency", trial.min_group_size
+    used = {
+        "topology": (trial.temperature, trial.temperature_unit),
+        "consensus": trial.consensus,
+    }
+    keys["score"] = keys["graph"], trial.resolved_score, used.get(trial.resolved_score)
     return keys
 
 
@@ -150,7 +157,7 @@ class TrialRunner:
     Example:
         >>> from tensor_stereo.datasets.synthetic import render_pair
         >>> runner = TrialRunner(render_pair(0))
-        >>> first, second = (runner.run(TrialConfig(restriction=name)) for name in ("adjacency", "cardinality"))
+        >>> first, second = (runner.run(TrialConfig(verdict=name)) for name in ("adjacency", "cardinality"))
         >>> first.graphs is second.graphs
         True
     """
@@ -186,7 +193,7 @@ class TrialRunner:
             return result
 
         features = share("detect", lambda: detect_pairs(self._gray, trial))
-        putative = share("match", lambda: match_features(*features, matching_settings(trial)))
+        putative = share("match", lambda: match_features(*features, trial))
         matches, correct, valid = share("perturb", lambda: self._perturb(putative, trial))
         if trial.constrained:
             labels = share("label", lambda: [label_objects(image, trial.objects) for image in self._gray[0]])
@@ -198,7 +205,7 @@ class TrialRunner:
         )
         verdict = share(
             "relate",
-            lambda: classify_graphs(graphs, restriction=trial.restriction, min_group_size=trial.min_group_size),
+            lambda: classify_graphs(graphs, trial),
         )
         score = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
         if score is not None:

@@ -176,6 +176,17 @@ class Classification:
     degree0: Tensor
     degree1: Tensor
 
+    def inlier_of(self, restriction: str) -> Tensor:
+        """(M,) bool, the verdict of one of the paper's restrictions, whatever decided ``inlier``.
+
+        Args:
+            restriction: ``adjacency``: both neighbour sets are equal. ``cardinality``: one contains the other.
+        """
+        equal = self.relation == int(Relation.EQUAL)
+        if restriction == "adjacency":
+            return equal
+        return equal | (self.relation == int(Relation.SUBSET)) | (self.relation == int(Relation.SUPERSET))
+
 
 @dataclass(frozen=True, eq=False)
 class StereoPair:
@@ -207,20 +218,43 @@ class StereoPair:
                 raise ValueError(f"{name} of {self.name!r} must have the images' shape {expected}, got {given}")
 
 
+def check_tensor(name: str, value: object) -> None:
+    """Raise unless ``value`` is a tensor; the message says how to make one."""
+    if isinstance(value, Tensor):
+        return
+    module, kind = type(value).__module__, type(value).__name__
+    convert = "torch.from_numpy" if module == "numpy" else "torch.as_tensor"
+    raise TypeError(f"{name} must be a torch.Tensor, got {kind}; convert with {convert}(...)")
+
+
 def check_points(name: str, points: Tensor) -> None:
     """Raise unless ``points`` is (N, 2) floating point."""
+    check_tensor(name, points)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"{name} must have shape (N, 2), got {tuple(points.shape)}")
+    check_pixels(name, points)
+
+
+def check_pixels(name: str, points: Tensor) -> None:
+    """Raise unless ``points`` are float32 or float64; half precision cannot tell pixels apart beyond 256 or 2048."""
     if points.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name} must be float32 or float64 pixels, got {points.dtype}")
+        raise TypeError(f"{name} must be float32 or float64 pixels, got {points.dtype}; convert with .float()")
+
+
+def check_mask(name: str, mask: Tensor) -> None:
+    """Raise unless ``mask`` is a tensor of bool."""
+    check_tensor(name, mask)
+    if mask.dtype != torch.bool:
+        raise TypeError(f"{name} must be bool, got {mask.dtype}; convert with .bool()")
 
 
 def check_ptr(name: str, ptr: Tensor, num_rows: int) -> None:
     """Raise unless ``ptr`` is a vector of non-decreasing offsets from 0 to ``num_rows``."""
+    check_tensor(name, ptr)
     if ptr.ndim != 1 or len(ptr) < 1:
         raise ValueError(f"{name} must have shape (B + 1,), got {tuple(ptr.shape)}")
     if ptr.dtype != torch.int64:
-        raise TypeError(f"{name} must be int64, got {ptr.dtype}")
+        raise TypeError(f"{name} must be int64, got {ptr.dtype}; convert with .long()")
     if torch.compiler.is_compiling():
         return  # values are not known yet; the operators look at them
     offsets = ptr.numpy(force=True)
@@ -236,6 +270,7 @@ def check_rows(name: str, values: Tensor, num_rows: int) -> None:
 
 def check_vector(name: str, values: Tensor, num_rows: int) -> None:
     """Raise unless ``values`` is a vector of ``num_rows`` elements."""
+    check_tensor(name, values)
     if values.shape != (num_rows,):
         raise ValueError(f"{name} must have shape ({num_rows},), got {tuple(values.shape)}")
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from tensor_stereo.configs import ClassifyConfig, EvaluationConfig, PipelineConfig
+from tensor_stereo.configs import EvaluationConfig, FileFilterConfig, PipelineConfig
 from tensor_stereo.datasets.releases import RELEASES
 
 Flat = tyro.conf.arg(name="")
@@ -16,7 +16,7 @@ Flat = tyro.conf.arg(name="")
 
 @dataclass(frozen=True)
 class Demo:
-    """Classify the embedded synthetic set with all detectors and print the paper's tables for it."""
+    """Classify the embedded synthetic set: the paper's tables, with the verdict of the score beside them."""
 
     num_pairs: int = 4
     """Pairs to render."""
@@ -41,13 +41,13 @@ class Classify:
     out: Path | None = None
     """Table of matches and verdicts, .csv or .parquet."""
     figure: Path | None = None
-    """PNG of both views, their matches and graphs."""
+    """PNG of both views, their matches by the verdicts and their graphs."""
     config: Annotated[PipelineConfig, Flat] = field(default_factory=PipelineConfig)
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Classify every pair below a folder and print the paper's five tables."""
+    """Classify every pair below a folder: the paper's tables, with the verdict of the score beside them."""
 
     root: tyro.conf.Positional[Path]
     """Folder with one or several stereo releases."""
@@ -72,7 +72,7 @@ class Filter:
     """File to write, with the same ending."""
     keypoints: Path | None = None
     """hloc's file of features, for .h5."""
-    config: Annotated[ClassifyConfig, Flat] = field(default_factory=ClassifyConfig)
+    config: Annotated[FileFilterConfig, Flat] = field(default_factory=FileFilterConfig)
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,8 @@ def _run_classify(command: Classify) -> None:
     )
     values = asdict(summary)
     rates = values.pop("rates") or {}
-    for name, value in (values | rates).items():
+    kept_by = {f"kept_by_{name}": count for name, count in values.pop("kept_by").items()}
+    for name, value in (values | kept_by | rates).items():
         print(f"{name:20}{value:8.2f}" if isinstance(value, float) else f"{name:20}{value:8}")
 
 

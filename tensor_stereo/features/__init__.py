@@ -5,13 +5,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from tensor_stereo.configs import DETECTORS, PipelineConfig
+from tensor_stereo.configs import PipelineConfig
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from tensor_stereo.features.fast import detect_fast as detect_fast
     from tensor_stereo.features.gftt import detect_gftt as detect_gftt
+    from tensor_stereo.features.images import list_images as list_images
     from tensor_stereo.features.images import to_gray as to_gray
     from tensor_stereo.features.sift import detect_sift as detect_sift
     from tensor_stereo.features.surf import detect_surf as detect_surf
@@ -24,6 +25,7 @@ _HOMES = {
     "detect_sift": "sift",
     "detect_surf": "surf",
     "extract_windows": "windows",
+    "list_images": "images",
     "to_gray": "images",
 }
 
@@ -43,7 +45,7 @@ def detect_features(images: Tensor, config: PipelineConfig | None = None) -> Fea
         Ragged features of the B images, strongest first within each.
 
     Raises:
-        ValueError: if ``images`` or a setting does not fit.
+        ValueError: if ``images`` has another shape, or values outside of [0, 1].
         TypeError: if ``images`` has another dtype.
 
     >>> import torch
@@ -51,8 +53,6 @@ def detect_features(images: Tensor, config: PipelineConfig | None = None) -> Fea
     tensor([0, 0, 0])
     """
     config = config or PipelineConfig()
-    if config.detector not in DETECTORS:
-        raise ValueError(f"PipelineConfig.detector must be one of {', '.join(DETECTORS)}, got {config.detector!r}")
     detect = getattr(import_module(f"{__name__}.{config.detector}"), f"detect_{config.detector}")
     features: Features = detect(images, getattr(config, config.detector))
     return features

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from tensor_stereo.configs import GFTTConfig
-from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
-from tensor_stereo.features.windows import check_window_px, extract_windows
+from tensor_stereo.features.images import join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.windows import extract_windows
 from tensor_stereo.types import Features
 
 _MIN_SIZE = 4  # px: the 7 x 7 blur of the structure tensor is reflected at the border, and that needs more than 3 px
@@ -36,7 +36,7 @@ def detect_gftt(images: Tensor, config: GFTTConfig | None = None) -> Features:
         with a side below 4 px (kornia) has no keypoints.
 
     Raises:
-        ValueError: if ``images`` or a setting does not fit.
+        ValueError: if ``images`` has another shape, or values outside of [0, 1].
         TypeError: if ``images`` has another dtype.
 
     >>> image = torch.zeros(1, 1, 32, 32, dtype=torch.uint8)
@@ -45,12 +45,6 @@ def detect_gftt(images: Tensor, config: GFTTConfig | None = None) -> Features:
     [[12.0, 10.0], [21.0, 10.0], [12.0, 19.0], [21.0, 19.0]]
     """
     config = config or GFTTConfig()
-    if config.backend not in ("kornia", "opencv"):
-        raise ValueError(f"GFTTConfig.backend must be 'kornia' or 'opencv', got {config.backend!r}")
-    check_range("GFTTConfig.quality_level", config.quality_level, 1e-9, 1)
-    check_range("GFTTConfig.min_distance_px", config.min_distance_px, 0, 2**15)
-    check_range("GFTTConfig.max_keypoints", config.max_keypoints, 1, 2**31 - 1)
-    check_window_px("GFTTConfig.window_px", config.window_px)
     gray = to_gray(images)
     if config.backend == "opencv":
         detected = map_images(lambda image: _detect_opencv(image, config), gray.cpu())
@@ -85,8 +79,8 @@ def _detect_opencv(image: Tensor, config: GFTTConfig) -> tuple[Tensor, Tensor]:
     detector = cv2.GFTTDetector.create(config.max_keypoints, config.quality_level, config.min_distance_px)
     found = detector.detect(image.numpy())
     if not found:
-        return torch.zeros(0, 2), torch.zeros(0)
+        return torch.zeros(0, 2, dtype=torch.float32), torch.zeros(0, dtype=torch.float32)
     keypoints = torch.from_numpy(cv2.KeyPoint.convert(found))
-    scores = torch.tensor([keypoint.response for keypoint in found])
+    scores = torch.tensor([keypoint.response for keypoint in found], dtype=torch.float32)
     order = strongest_first(keypoints, scores, config.max_keypoints)
     return keypoints[order], scores[order]

@@ -11,8 +11,43 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.types import check_tensor
 
 T = TypeVar("T")
+
+
+def list_images(name: str, images: Tensor | Sequence[Tensor], num_pairs: int) -> list[Tensor]:
+    """The images of one view of B pairs, one by one.
+
+    Args:
+        name: Name of the argument, for errors.
+        images: (B, C, H, W), or B images (C, H, W) of any sizes; for one pair also (C, H, W).
+        num_pairs: B.
+
+    Returns:
+        B images (C, H, W).
+
+    Raises:
+        TypeError: if an image is no tensor.
+        ValueError: for other shapes, or another number of images.
+
+    >>> [image.shape for image in list_images("images0", torch.zeros(3, 8, 9), 1)]
+    [torch.Size([3, 8, 9])]
+    """
+    if isinstance(images, list | tuple):
+        found = list(images)
+    else:
+        check_tensor(name, images)
+        batch = torch.as_tensor(images)
+        found = list(batch) if batch.ndim == 4 else [batch]
+    for b, image in enumerate(found):
+        check_tensor(f"{name}[{b}]", image)
+        if image.ndim != 3 or image.shape[0] not in (1, 3):
+            shape = tuple(image.shape)
+            raise ValueError(f"{name} must be images (C, H, W) with C = 1 or 3, or a batch (B, C, H, W), got {shape}")
+    if len(found) != num_pairs:
+        raise ValueError(f"{name} must hold one image per pair ({num_pairs}), got {len(found)}")
+    return found
 
 
 @torch.no_grad()
@@ -122,16 +157,12 @@ def join_images(
     (torch.Size([2, 2]), torch.Size([2]), tensor([0, 2]))
     """
     columns = [
-        torch.cat([torch.zeros(0, *shape, device=device), *(part[k].to(device, torch.float32) for part in parts)])
+        torch.cat(
+            [
+                torch.zeros(0, *shape, dtype=torch.float32, device=device),
+                *(part[k].to(device, torch.float32) for part in parts),
+            ]
+        )
         for k, shape in enumerate(shapes)
     ]
     return columns, lengths_to_ptr(torch.tensor([len(part[0]) for part in parts], dtype=torch.int64, device=device))
-
-
-def check_range(name: str, value: float, low: float, high: float) -> None:
-    """Raise unless a setting lies in [low, high]; NaN does not.
-
-    >>> check_range("FASTConfig.threshold", 20, 0, 255)
-    """
-    if not low <= value <= high:
-        raise ValueError(f"{name} must lie in [{low:g}, {high:g}], got {value}")

@@ -8,7 +8,7 @@ from kornia.feature import SIFTFeatureScaleSpace, get_laf_center, laf_is_filled
 from torch import Tensor, nn
 
 from tensor_stereo.configs import SIFTConfig
-from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.images import join_images, map_images, strongest_first, to_gray
 from tensor_stereo.types import Features
 
 _SIZE = 128  # 4 x 4 cells of 8 directions
@@ -43,7 +43,7 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
         backend's own factor. An image without texture or with a side below about 6 px has no keypoints.
 
     Raises:
-        ValueError: if ``images`` or a setting does not fit.
+        ValueError: if ``images`` has another shape, or values outside of [0, 1].
         TypeError: if ``images`` has another dtype.
 
     >>> y, x = torch.meshgrid(torch.arange(64.0), torch.arange(80.0), indexing="ij")
@@ -52,11 +52,10 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
     [40.0, 30.0]
     """
     config = config or SIFTConfig()
-    check_range("SIFTConfig.max_keypoints", config.max_keypoints, 1, 2**31 - 1)
     gray = to_gray(images)
     if config.backend == "opencv":
         detected = map_images(lambda image: _detect_opencv(image, config), gray.cpu())
-    elif config.backend == "kornia":
+    else:
         module = SIFTFeatureScaleSpace(
             config.max_keypoints,
             upright=config.upright,
@@ -67,8 +66,6 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
         )
         # kornia's operators bring threads of their own; a second image fills the gaps between them
         detected = map_images(lambda image: _detect_kornia(image, module, config), gray, max_workers=2)
-    else:
-        raise ValueError(f"SIFTConfig.backend must be 'kornia' or 'opencv', got {config.backend!r}")
     (keypoints, descriptors, scores), ptr = join_images(detected, [(2,), (_SIZE,), ()], gray.device)
     return Features(keypoints, ptr, descriptors, scores)
 
@@ -95,8 +92,9 @@ def _detect_opencv(image: Tensor, config: SIFTConfig) -> tuple[Tensor, Tensor, T
     else:
         found, vectors = sift.detectAndCompute(image.numpy(), None)
     if not found:
-        return torch.zeros(0, 2), torch.zeros(0, _SIZE), torch.zeros(0)
+        nothing = torch.zeros(0, dtype=torch.float32)
+        return nothing.reshape(0, 2), nothing.reshape(0, _SIZE), nothing
     keypoints = torch.from_numpy(cv2.KeyPoint.convert(found))
-    scores = torch.tensor([keypoint.response for keypoint in found])
+    scores = torch.tensor([keypoint.response for keypoint in found], dtype=torch.float32)
     order = strongest_first(keypoints, scores, config.max_keypoints)
     return keypoints[order], torch.from_numpy(vectors)[order] / _OPENCV_NORM, scores[order]

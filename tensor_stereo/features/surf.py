@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tensor_stereo.configs import SURFConfig
-from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.images import join_images, map_images, strongest_first, to_gray
 from tensor_stereo.types import Features
 
 _SIZE = 64  # 4 x 4 cells of 4 sums
@@ -39,7 +39,7 @@ def detect_surf(images: Tensor, config: SURFConfig | None = None) -> Features:
         so that an image without texture, or with a side below about 60 px, has none.
 
     Raises:
-        ValueError: if ``images`` or a setting does not fit.
+        ValueError: if ``images`` has another shape, or values outside of [0, 1].
         TypeError: if ``images`` has another dtype.
 
     >>> y, x = torch.meshgrid(torch.arange(120.0), torch.arange(130.0), indexing="ij")
@@ -48,11 +48,6 @@ def detect_surf(images: Tensor, config: SURFConfig | None = None) -> Features:
     [60.2..., 58.0]
     """
     config = config or SURFConfig()
-    check_range("SURFConfig.num_octaves", config.num_octaves, 1, 8)
-    check_range("SURFConfig.num_scales", config.num_scales, 3, 16)
-    check_range("SURFConfig.initial_step_px", config.initial_step_px, 1, 16)
-    check_range("SURFConfig.threshold", config.threshold, 0, float("inf"))
-    check_range("SURFConfig.max_keypoints", config.max_keypoints, 1, 2**31 - 1)
     gray = to_gray(images)
     detected = map_images(lambda image: _detect(image, config), gray.cpu())
     (keypoints, descriptors, scores), ptr = join_images(detected, [(2,), (_SIZE,), ()], gray.device)

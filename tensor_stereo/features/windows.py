@@ -42,7 +42,7 @@ def extract_windows(images: Tensor, keypoints: Tensor, ptr: Tensor, *, window_px
     if images.dtype != torch.uint8:
         raise TypeError(f"images must be uint8, got {images.dtype}")
     if len(keypoints) == 0:
-        return torch.zeros(0, window_px**2, device=images.device)
+        return torch.zeros(0, window_px**2, dtype=torch.float32, device=images.device)
     height, width = images.shape[2:]
     nearest = keypoints.round()
     size = nearest.new_tensor([width, height])

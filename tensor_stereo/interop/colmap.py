@@ -43,8 +43,9 @@ def filter_colmap(source: Path, target: Path, run: MatchFilter) -> FilterSummary
 
     Every pair of that table goes through the filter; matches have no cost. The table ``tensor_stereo_verdicts`` of the
     copy holds all putative matches: ``pair_id, rows, cols, data`` as ``matches`` had them, and of ``rows`` values each
-    the blobs ``inlier`` uint8, ``score`` float32 and ``relation`` int8. The rows of ``two_view_geometries`` whose pair
-    loses matches are removed, since they were estimated from those too: run COLMAP's geometric verification again.
+    the blobs ``inlier`` uint8, ``score`` float32 (NULL if the settings name none) and ``relation`` int8. The rows of
+    ``two_view_geometries`` whose pair loses matches are removed, since they were estimated from those too: run COLMAP's
+    geometric verification again.
 
     Raises:
         ValueError: if the database is damaged, unfinished or no such; the message names file, table and pair.
@@ -150,7 +151,8 @@ def _read_blob(place: str, database: sqlite3.Connection, table: str, key: int, d
 
 def _write_verdicts(database: sqlite3.Connection, pair_id: int, verdicts: Verdicts) -> None:
     copied = f"INSERT INTO {TABLE} SELECT pair_id, rows, cols, data, ?, ?, ? FROM matches WHERE pair_id = ?"
-    blobs = verdicts.inlier.tobytes(), verdicts.score.astype("<f4").tobytes(), verdicts.relation.tobytes()
+    score = None if verdicts.score is None else verdicts.score.astype("<f4").tobytes()
+    blobs = verdicts.inlier.tobytes(), score, verdicts.relation.tobytes()
     database.execute(copied, (*blobs, pair_id))
     rows = _read_blob(f"pair_id {pair_id}", database, "matches", pair_id, "<u4")[verdicts.inlier]
     changed = "UPDATE matches SET rows = ?, data = ? WHERE pair_id = ?"

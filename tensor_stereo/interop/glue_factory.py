@@ -14,11 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.configs import UNRECTIFIED
+from tensor_stereo.configs import UNRECTIFIED, ConsensusConfig
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.modules import DelaunayFilter
-from tensor_stereo.types import Matches, check_vector
+from tensor_stereo.types import Matches, check_tensor, check_vector
 
+_ENTRIES = (
+    *("keypoints0", "keypoints1"),
+    *("matches0", "matches1", "matching_scores0", "matching_scores1"),
+)
 # Entries that glue-factory itself puts into the configuration of a component.
 _PIPELINE_KEYS = ("name", "trainable", "freeze_batch_normalization", "timeit", "apply_loss", "visualize")
 
@@ -28,8 +32,8 @@ def from_glue_factory(data: Mapping[str, Any]) -> tuple[Matches, Tensor]:
 
     Args:
         data: ``keypoints0`` (B, N0, 2) and ``keypoints1`` (B, N1, 2), (x, y) in px, ``matches0`` (B, N0) int64 with -1
-            and -2 for keypoints without a match, and optionally ``matching_scores0`` (B, N0), higher is better. Other
-            entries are not read.
+            and -2 for keypoints without a match, and optionally ``matching_scores0`` (B, N0), higher is better. One
+            pair may come without the batch axis, in all of them. Other entries are not read.
 
     Returns:
         Matches of B pairs, ordered by the row in view 0, with the cost 1 - score if there are scores, and their
@@ -52,6 +56,10 @@ def from_glue_factory(data: Mapping[str, Any]) -> tuple[Matches, Tensor]:
     missing = [name for name in ("keypoints0", "keypoints1", "matches0") if name not in data]
     if missing:
         raise ValueError(f"data must hold {missing[0]!r}, got the keys {sorted(data)}")
+    for name in ("keypoints0", "keypoints1", "matches0"):
+        check_tensor(name, data[name])
+    if data["keypoints0"].ndim == 2:
+        data = _with_batch_axis(data)
     keypoints0, keypoints1, matches0 = data["keypoints0"], data["keypoints1"], data["matches0"]
     if matches0.dtype != torch.int64:
         raise TypeError(f"matches0 must be int64, got {matches0.dtype}")
@@ -85,8 +93,8 @@ def to_glue_factory(
 
     Returns:
         New tensors for those of ``matches0``, ``matches1``, ``matching_scores0`` and ``matching_scores1`` that ``data``
-        holds. A rejected match becomes -1 with score 0, on both sides. The score of an inlier is multiplied by
-        ``score``. All other places keep their value, so -2 stays -2. Gradients flow to both scores.
+        holds, in their layout. A rejected match becomes -1 with score 0, on both sides. The score of an inlier is
+        multiplied by ``score``. All other places keep their value, so -2 stays -2. Gradients flow to both scores.
 
     Raises:
         ValueError: if ``indices``, ``inlier`` or ``score`` has another number of rows.
@@ -105,7 +113,10 @@ def to_glue_factory(
         raise TypeError(f"inlier must be bool, got {inlier.dtype}")
     if score is not None:
         check_vector("score", score, len(indices))
-    weight = inlier.to(torch.get_default_dtype()) if score is None else torch.where(inlier, score, 0)
+    weight = inlier.float() if score is None else torch.where(inlier, score, 0)
+    if data["matches0"].ndim == 1:
+        batched = to_glue_factory(_with_batch_axis(data), indices, inlier, score)
+        return {name: values[0] for name, values in batched.items()}
     pair, row0, row1 = indices.unbind(1)
     result = _write_view(data, "0", (pair, row0), inlier, weight)
     if "matches1" in data:
@@ -113,6 +124,11 @@ def to_glue_factory(
         mutual = data["matches1"][pair, row1] == row0
         result |= _write_view(data, "1", (pair[mutual], row1[mutual]), inlier[mutual], weight[mutual])
     return result
+
+
+def _with_batch_axis(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that the converters read, of one pair, as a batch of one."""
+    return {name: data[name][None] for name in _ENTRIES if data.get(name) is not None}
 
 
 def _write_view(
@@ -127,6 +143,30 @@ def _write_view(
     return result
 
 
+def two_view_filter(**settings: Any) -> DelaunayFilter:
+    """The default filter for matches of any two views, which need not be rectified.
+
+    Its verdict is ``cardinality``, Restriction 2 of the paper, and its score is ``consensus`` without row offsets.
+
+    Args:
+        **settings: Settings of :class:`~tensor_stereo.DelaunayFilter` in place of these.
+
+    >>> two_view_filter().config.verdict
+    'cardinality'
+    """
+    defaults: dict[str, Any] = {"verdict": "cardinality", "score": "consensus", "consensus": UNRECTIFIED}
+    return DelaunayFilter(**defaults | settings)
+
+
+def _images_of(data: Mapping[str, Any], run: Callable[..., FilterOutput]) -> dict[str, Tensor]:
+    """The images of both views, where there are such and the filter looks at them."""
+    if not isinstance(run, DelaunayFilter) or run.config.resolved_score != "learned":
+        return {}
+    images = {f"images{view}": (data.get(f"view{view}") or {}).get("image") for view in (0, 1)}
+    found = {name: image for name, image in images.items() if image is not None}
+    return found if len(found) == 2 else {}
+
+
 class GlueFactoryFilter(nn.Module):
     """The ``filter`` of a two-view pipeline: dictionary in, the entries that change out.
 
@@ -135,10 +175,12 @@ class GlueFactoryFilter(nn.Module):
 
         filter:
             name: tensor_stereo.interop.glue_factory
-            restriction: adjacency
+            verdict: adjacency
 
     Args:
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter(consensus=UNRECTIFIED)``.
+        filter: Takes Matches, returns a FilterOutput; None is :func:`two_view_filter`. A
+            :class:`~tensor_stereo.DelaunayFilter` whose score looks at images gets those of ``data["view0"]["image"]``
+            and ``data["view1"]["image"]``, if they are there; it expects rectified pairs.
 
     Example:
         >>> x, y = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="xy")
@@ -150,14 +192,20 @@ class GlueFactoryFilter(nn.Module):
 
     required_data_keys = ("keypoints0", "keypoints1", "matches0")
 
-    def __init__(self, filter: Callable[[Matches], FilterOutput] | None = None) -> None:  # noqa: A002 - the slot's name
+    def __init__(self, filter: Callable[..., FilterOutput] | None = None) -> None:  # noqa: A002 - the slot's name
         super().__init__()
-        self.filter = DelaunayFilter(consensus=UNRECTIFIED) if filter is None else filter
+        self.filter = two_view_filter() if filter is None else filter
 
     @classmethod
     def from_conf(cls, conf: Mapping[str, Any]) -> GlueFactoryFilter:
-        """The filter of a glue-factory configuration; entries that DelaunayFilter lacks raise TypeError."""
-        return cls(DelaunayFilter(**{name: value for name, value in conf.items() if name not in _PIPELINE_KEYS}))
+        """The filter of a glue-factory configuration; entries that DelaunayFilter lacks raise TypeError.
+
+        Without any setting it is :func:`two_view_filter`.
+        """
+        settings = {name: value for name, value in conf.items() if name not in _PIPELINE_KEYS}
+        if isinstance(settings.get("consensus"), Mapping):
+            settings["consensus"] = ConsensusConfig(**settings["consensus"])
+        return cls(two_view_filter(**settings))
 
     def forward(self, data: Mapping[str, Any]) -> dict[str, Tensor]:
         """Take out what the filter rejects.
@@ -170,7 +218,7 @@ class GlueFactoryFilter(nn.Module):
             matcher's scores, and to the keypoints if the filter's score is differentiable.
         """
         matches, indices = from_glue_factory(data)
-        output = self.filter(matches)
+        output = self.filter(matches, **_images_of(data, self.filter))
         return to_glue_factory(data, indices, output.inlier, output.score)
 
     def loss(self, pred: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

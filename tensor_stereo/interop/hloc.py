@@ -252,9 +252,11 @@ def _read(place: str, group: Any, name: str, kinds: str, ndim: int) -> Array:
 
 def _write_verdicts(group: Any, matches0: Array, verdicts: Verdicts) -> None:
     wide = verdicts.spread(matches0 >= 0)
-    results = {"putative_matches0": matches0, **wide._asdict(), "score": wide.score.astype(np.float32)}
+    score = None if wide.score is None else wide.score.astype(np.float32)
+    results = {"putative_matches0": matches0, **wide._asdict(), "score": score}
     for name, values in results.items():
         if group.id.links.exists(name.encode()):  # of an earlier filter
             del group[name]
-        group.create_dataset(name, data=values)
+        if values is not None:
+            group.create_dataset(name, data=values)
     group["matches0"][...] = np.where((matches0 < 0) | wide.inlier, matches0, -1)

@@ -14,11 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import batch_to_ptr
-from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.filters import FilterOutput
-from tensor_stereo.interop.glue_factory import from_glue_factory, to_glue_factory
-from tensor_stereo.modules import DelaunayFilter
-from tensor_stereo.types import Matches, check_integer, check_vector
+from tensor_stereo.interop.glue_factory import from_glue_factory, to_glue_factory, two_view_filter
+from tensor_stereo.modules import Images
+from tensor_stereo.types import Matches, check_integer, check_tensor, check_vector
 
 _ROWS = ("keypoints0", "keypoints1", "confidence", "batch_indexes")  # what LoFTR returns, one row per match
 
@@ -29,7 +28,8 @@ def from_lightglue(data: Mapping[str, Any], output: Mapping[str, Any]) -> tuple[
     Args:
         data: its input, of which ``data["image0"]["keypoints"]`` (B, N0, 2) and ``data["image1"]["keypoints"]``
             (B, N1, 2) are read, (x, y) in px.
-        output: its output, of which ``matches0`` and ``matching_scores0`` (B, N0) are read.
+        output: its output, of which ``matches0`` and ``matching_scores0`` (B, N0) are read. One pair may come without
+            the batch axis, in all entries of both.
 
     Returns:
         Matches of B pairs with the cost 1 - score, and indices (M, 3) int64: pair, row in view 0, row in view 1.
@@ -81,6 +81,13 @@ def to_lightglue(
         tensor([[-1,  0]])
     """
     result: dict[str, Any] = {**output, **to_glue_factory(output, indices, inlier, score)}
+    if result["matches0"].ndim == 1:  # one pair without batch axis
+        row0 = (result["matches0"] >= 0).nonzero()[:, 0]
+        lists = {
+            "matches": torch.stack([row0, result["matches0"][row0]], dim=-1),
+            "scores": result["matching_scores0"][row0],
+        }
+        return result | {name: values for name, values in lists.items() if name in output}
     kept = [row.nonzero()[:, 0] for row in result["matches0"] >= 0]
     if "matches" in output:
         rows = zip(kept, result["matches0"], strict=True)
@@ -95,7 +102,7 @@ def from_loftr(output: Mapping[str, Any], *, num_pairs: int | None = None) -> Ma
 
     Args:
         output: ``keypoints0`` and ``keypoints1`` (M, 2), (x, y) in px, ``batch_indexes`` (M,) int64, sorted, and
-            ``confidence`` (M,), higher is better.
+            ``confidence`` (M,), higher is better. Without ``batch_indexes`` it is one pair.
         num_pairs: B; the default ends with the last pair that has matches.
 
     Returns:
@@ -111,14 +118,17 @@ def from_loftr(output: Mapping[str, Any], *, num_pairs: int | None = None) -> Ma
         >>> from_loftr(output, num_pairs=4).ptr
         tensor([0, 1, 1, 2, 2])
     """
-    missing = [name for name in _ROWS if name not in output]
+    missing = [name for name in _ROWS if name not in output and name != "batch_indexes"]
     if missing:
         raise ValueError(f"output must hold {missing[0]!r}, got the keys {sorted(output)}")
     keypoints0 = output["keypoints0"]
+    cost = (1 - output["confidence"]).to(keypoints0.dtype)
+    if "batch_indexes" not in output:
+        return Matches(keypoints0, output["keypoints1"], torch.tensor([0, len(keypoints0)]), cost)
     check_vector("batch_indexes", output["batch_indexes"], len(keypoints0))
     check_integer("batch_indexes", output["batch_indexes"])
     ptr = batch_to_ptr(output["batch_indexes"], num_pairs)
-    return Matches(keypoints0, output["keypoints1"], ptr, (1 - output["confidence"]).to(keypoints0.dtype))
+    return Matches(keypoints0, output["keypoints1"], ptr, cost)
 
 
 def to_loftr(output: Mapping[str, Any], inlier: Tensor, score: Tensor | None = None) -> dict[str, Any]:
@@ -147,7 +157,7 @@ def to_loftr(output: Mapping[str, Any], inlier: Tensor, score: Tensor | None = N
     if inlier.dtype != torch.bool:
         raise TypeError(f"inlier must be bool, got {inlier.dtype}")
     result = dict(output)
-    for name in _ROWS:
+    for name in (name for name in _ROWS if name in output):
         result[name] = output[name][inlier]
     for name in ("lafs0", "lafs1"):
         if name in output:
@@ -162,8 +172,9 @@ def from_lafs(lafs0: Tensor, lafs1: Tensor, indices: Tensor, distances: Tensor |
     """The matches of kornia's descriptor matchers.
 
     Args:
-        lafs0: (B, N0, 2, 3) local affine frames of view 0; the keypoint is the last column, (x, y) in px.
-        lafs1: (B, N1, 2, 3).
+        lafs0: (B, N0, 2, 3), or (N0, 2, 3) for one pair: local affine frames of view 0; the keypoint is the last
+            column, (x, y) in px.
+        lafs1: (B, N1, 2, 3) or (N1, 2, 3).
         indices: (K, 2) int64 rows in view 0 and view 1 as from ``match_snn``, for B = 1; or (K, 3) with the pair in
             front, sorted by it, as from ``match_smnn_batched``.
         distances: (K, 1) or (K,), lower is better; becomes the cost. Do not pass LightGlueMatcher's first result,
@@ -181,6 +192,9 @@ def from_lafs(lafs0: Tensor, lafs1: Tensor, indices: Tensor, distances: Tensor |
         >>> from_lafs(lafs, lafs - 1, torch.tensor([[0, 0]])).keypoints1
         tensor([[6., 7.]])
     """
+    for name, value in (("lafs0", lafs0), ("lafs1", lafs1), ("indices", indices)):
+        check_tensor(name, value)
+    lafs0, lafs1 = (lafs[None] if lafs.ndim == 3 else lafs for lafs in (lafs0, lafs1))
     for name, lafs in (("lafs0", lafs0), ("lafs1", lafs1)):
         if lafs.ndim != 4 or lafs.shape[2:] != (2, 3) or len(lafs) != len(lafs0):
             raise ValueError(f"{name} must have shape (B, N, 2, 3) with one B for both views, got {tuple(lafs.shape)}")
@@ -205,22 +219,29 @@ def filter_matches(
     indices: Tensor,
     *,
     distances: Tensor | None = None,
-    filter: Callable[[Matches], FilterOutput] | None = None,  # noqa: A002
+    filter: Callable[..., FilterOutput] | None = None,  # noqa: A002
+    images1: Images | None = None,
+    images2: Images | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Keep the matches whose neighbours agree; in the form of kornia's matchers, but without descriptors.
 
     Args:
-        lafs1: (B, N1, 2, 3) local affine frames of the first view, px.
-        lafs2: (B, N2, 2, 3) of the second view.
+        lafs1: (B, N1, 2, 3), or (N1, 2, 3) for one pair: local affine frames of the first view, px.
+        lafs2: (B, N2, 2, 3) or (N2, 2, 3), of the second view.
         indices: (K, 2) or (K, 3) int64, as for :func:`from_lafs`.
         distances: (K, 1) or (K,) of the matcher, lower is better. They only decide which of several matches of one
             keypoint counts; without them it is the first.
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter(consensus=UNRECTIFIED)``.
+        filter: Takes Matches, returns a FilterOutput; None is
+            :func:`~tensor_stereo.interop.glue_factory.two_view_filter`, as kornia's pairs need not be rectified. For
+            rectified pairs ``DelaunayFilter()`` is best.
+        images1: Images of the first view, (B, C, H, W), a list of (C, H, W), or (C, H, W) for one pair; handed to the
+            filter, whose score ``learned`` looks at them.
+        images2: Images of the second view.
 
     Returns:
-        distances (K', 1), which are 1 - score of the filter, so that kornia's confidence, 1 - distance, is that score;
-        and the K' rows of ``indices`` that are inliers, in their order. Gradients flow to the LAFs if the score is
-        differentiable.
+        distances (K', 1), which are 1 - score of the filter, so that kornia's confidence, 1 - distance, is that score
+        (those of the matcher, or 0, where the filter has no score); and the K' rows of ``indices`` that are inliers, in
+        their order. Gradients flow to the LAFs if the score is differentiable.
 
     Raises:
         ValueError, TypeError: as :func:`from_lafs`.
@@ -233,10 +254,14 @@ def filter_matches(
         >>> distances.shape, indices.shape
         (torch.Size([16, 1]), torch.Size([16, 2]))
     """
-    output = (DelaunayFilter(consensus=UNRECTIFIED) if filter is None else filter)(
-        from_lafs(lafs1, lafs2, indices, distances)
-    )
-    return 1 - output.score[output.inlier][:, None], indices[output.inlier]
+    matches = from_lafs(lafs1, lafs2, indices, distances)
+    images = {} if images1 is None and images2 is None else {"images0": images1, "images1": images2}
+    output = (two_view_filter() if filter is None else filter)(matches, **images)
+    if output.score is not None:
+        distance = 1 - output.score
+    else:
+        distance = matches.keypoints0.new_zeros(matches.num_matches) if matches.cost is None else matches.cost
+    return distance[output.inlier][:, None], indices[output.inlier]
 
 
 class LocatedFeature(nn.Module):
@@ -269,7 +294,8 @@ class FilteredMatcher(nn.Module):
 
     Args:
         matcher: called as ``matcher(desc1, desc2)``; returns distances (K, 1) and indices (K, 2).
-        filter: takes Matches, returns a FilterOutput; None is ``DelaunayFilter(consensus=UNRECTIFIED)``.
+        filter: Takes Matches, returns a FilterOutput; None is
+            :func:`~tensor_stereo.interop.glue_factory.two_view_filter`.
 
     Example:
         >>> nearest = lambda desc1, desc2: torch.cdist(desc1, desc2).min(1, keepdim=True)
@@ -289,7 +315,7 @@ class FilteredMatcher(nn.Module):
     ) -> None:
         super().__init__()
         self.matcher = matcher
-        self.filter = DelaunayFilter(consensus=UNRECTIFIED) if filter is None else filter
+        self.filter = two_view_filter() if filter is None else filter
 
     def forward(
         self, desc1: Tensor, desc2: Tensor, lafs1: Tensor | None = None, lafs2: Tensor | None = None

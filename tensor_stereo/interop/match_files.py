@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 
 from tensor_stereo.atomic import whole_file
-from tensor_stereo.configs import UNRECTIFIED, ClassifyConfig
+from tensor_stereo.configs import FileFilterConfig, FilterConfig
 from tensor_stereo.interop.colmap import filter_colmap
 from tensor_stereo.interop.hloc import filter_hloc
 from tensor_stereo.interop.match_tables import filter_table
-from tensor_stereo.interop.npz import filter_npz
+from tensor_stereo.interop.npz import filter_npz, holds_indices
 from tensor_stereo.interop.verdicts import FilterSummary
 from tensor_stereo.modules import DelaunayFilter
 
@@ -29,7 +29,7 @@ def filter_file(
     out: Path,
     *,
     keypoints: Path | None = None,
-    config: ClassifyConfig | None = None,
+    config: FilterConfig | None = None,
 ) -> FilterSummary:
     r"""Decide which matches of a file are right, and write the file again with verdict and score.
 
@@ -44,15 +44,18 @@ def filter_file(
     ============  ==================================================================================================
 
     Verdict and score are those of :class:`~tensor_stereo.DelaunayFilter` on all pairs as one batch, in blocks of
-    bounded size, with coordinates in float64; those of ``.h5`` and ``.db`` are not taken to be rectified. Pairs with
-    few or no matches are UNTESTED. Files are data only: nothing in them is run, unpickled or taken for a path, and no
+    bounded size, with coordinates in float64. Files of rows are taken to come from rectified pairs, and a match is kept
+    if its probability is at least .5. Files of hloc, COLMAP and LightGlue (``.npz`` with ``matches0``) are not: there
+    the default verdict is ``cardinality``, with a ``consensus`` score for any two views. Pairs with few or no matches
+    are UNTESTED. Files are data only: nothing in them is run, unpickled or taken for a path, and no
     size in them is believed before it is checked.
 
     Args:
         source: file of putative matches. It is not changed.
         out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced.
         keypoints: hloc's file of features; for ``.h5`` only.
-        config: settings of verdict and score; None is ``ClassifyConfig()``.
+        config: Settings of verdict and score, the same for all forms; None or a
+            :class:`~tensor_stereo.configs.FileFilterConfig` leaves the verdict to the form of the file.
 
     Returns:
         Counts of pairs and matches.
@@ -69,14 +72,19 @@ def filter_file(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     source, out = Path(folder, "matches.csv"), Path(folder, "filtered.csv")
         ...     _ = source.write_text("x0,y0,x1,y1\n0,0,-3,0\n9,1,6,1\n1,8,-2,8\n8,9,5,9\n")
-        ...     filter_file(source, out).num_kept, out.read_text().splitlines()[:2]  # doctest: +ELLIPSIS
-        (4, ['x0,y0,x1,y1,inlier,score,relation', '0,0,-3,0,true,...,equal'])
+        ...     config = FilterConfig(verdict="cardinality")
+        ...     filter_file(source, out, config=config).num_kept, out.read_text().splitlines()[:2]
+        (4, ['x0,y0,x1,y1,inlier,relation', '0,0,-3,0,true,equal'])
     """
     ending = _check_files(source, out, keypoints)
-    config = ClassifyConfig() if config is None else config
-    settings = {field.name: getattr(config, field.name) for field in fields(ClassifyConfig)}
-    consensus = UNRECTIFIED if ending in (".h5", ".db") else None  # of any two views, as structure from motion has
-    run = DelaunayFilter(**settings, consensus=consensus)
+    if config is None:
+        config = FileFilterConfig()
+    if isinstance(config, FileFilterConfig):
+        is_indexed = ending == ".npz" and holds_indices(source)
+        config = config.resolve(rectified=not is_indexed and ending not in (".h5", ".db"))
+    if config.resolved_score == "none":
+        config = replace(config, score="none")  # nobody asks for a gradient here
+    run = DelaunayFilter(config)
     with whole_file(out) as target:
         if ending == ".npz":
             return filter_npz(source, target, run)

@@ -32,7 +32,7 @@ _DECODE += "; print(n.item(), flush=True); n.item() > int(sys.argv[2]) or f.coll
 
 
 def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
-    """Copy a table and add ``inlier``, ``score`` and ``relation``, by name in lower case.
+    """Copy a table and add ``inlier``, ``score`` if the settings name one, and ``relation``, by name in lower case.
 
     Columns: ``x0, y0, x1, y1`` in px, and optionally ``pair``, a string or an integer that names the pair of a row,
     whose rows need not be adjacent; ``cost``, lower is better; ``group``, integer. All rows and columns are kept, in
@@ -52,9 +52,11 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     verdicts = filter_matches(_to_matches(source, table, pair, order), run)
     verdicts = verdicts.take(np.argsort(order, kind="stable"))
     names = {relation.value: relation.name.lower() for relation in Relation}
+    if verdicts.score is None:
+        table = table.drop("score", strict=False)  # of an earlier filter
     table = table.with_columns(
         pl.Series("inlier", verdicts.inlier),
-        pl.Series("score", verdicts.score),
+        *([] if verdicts.score is None else [pl.Series("score", verdicts.score)]),
         pl.Series("relation", verdicts.relation).replace_strict(names, return_dtype=pl.String),
     )
     try:

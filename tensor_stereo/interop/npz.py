@@ -46,7 +46,7 @@ _INDEXED = {
 
 
 def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
-    """Copy an archive and add ``inlier`` bool, ``score`` float64 and ``relation`` int8.
+    """Copy an archive and add ``inlier`` bool, ``relation`` int8 and, if the settings name one, ``score`` float64.
 
     Two forms are read. Rows, as in :class:`~tensor_stereo.Matches`: ``keypoints0`` and ``keypoints1`` (M, 2), and
     optionally ``ptr`` (B + 1,), ``cost`` (M,) and ``group`` (M,); the results are (M,). One pair, as LightGlue and
@@ -74,11 +74,22 @@ def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
                     if name not in Verdicts._fields:
                         _copy_member(archive, info, result)
                 for name, values in _to_rows(arrays, verdicts)._asdict().items():
+                    if values is None:
+                        continue
                     with result.open(f"{name}.npy", "w", force_zip64=True) as file:
                         np.lib.format.write_array(file, values, allow_pickle=False)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
         raise ValueError(f"{source} is no readable archive: {error}") from error
     return FilterSummary().add(num_pairs, verdicts)
+
+
+def holds_indices(source: Path) -> bool:
+    """Whether an archive names partners by ``matches0``, as LightGlue and glue-factory do; False if it is damaged."""
+    try:
+        with zipfile.ZipFile(source) as archive:
+            return "matches0.npy" in archive.namelist()
+    except (zipfile.BadZipFile, EOFError, NotImplementedError):
+        return False
 
 
 def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:

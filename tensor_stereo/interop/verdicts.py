@@ -54,19 +54,25 @@ class Verdicts(NamedTuple):
     """Verdict on every match."""
 
     inlier: Bool  # (M,)
-    score: Float  # (M,) in [0, 1], higher is better, 0 for untested matches
+    score: Float | None  # (M,) in [0, 1], higher is better, 0 for untested matches; None if the settings ask for none
     relation: Int8  # (M,) values of Relation
 
     def spread(self, mask: Bool) -> Verdicts:
         """The same at the M True places of ``mask`` (N,); no inlier, 0 and UNTESTED elsewhere."""
-        num_rows = len(mask)
-        inlier, score, relation = np.zeros(num_rows, np.bool_), np.zeros(num_rows), np.zeros(num_rows, np.int8)
-        inlier[mask], score[mask], relation[mask] = self
-        return Verdicts(inlier, score, relation)
+        return self._map(lambda values: _spread(values, mask))
 
     def take(self, rows: Int) -> Verdicts:
         """The verdicts of ``rows``, in their order."""
-        return Verdicts(self.inlier[rows], self.score[rows], self.relation[rows])
+        return self._map(lambda values: values[rows])
+
+    def _map(self, change: Callable[[Array], Array]) -> Verdicts:
+        return Verdicts(*(None if values is None else change(values) for values in self))  # type: ignore[arg-type]
+
+
+def _spread(values: Array, mask: Bool) -> Array:
+    wide = np.zeros(len(mask), values.dtype)
+    wide[mask] = values
+    return wide
 
 
 def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
@@ -83,16 +89,17 @@ def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
         array([ True,  True,  True,  True])
     """
     ptr = matches.ptr.numpy()
-    parts = [Verdicts(np.zeros(0, np.bool_), np.zeros(0), np.zeros(0, np.int8))]
+    parts: list[Verdicts] = []
     start = 0
-    while start < matches.num_pairs:
+    while start < matches.num_pairs or not parts:  # of no pairs there are verdicts too, empty ones
         fitting = int(np.searchsorted(ptr, ptr[start] + BLOCK_MATCHES, side="right")) - 1
-        stop = max(fitting, start + 1)  # a pair is never cut
+        stop = min(max(fitting, start + 1), matches.num_pairs)  # a pair is never cut
         output = run(select_pairs(matches, start, stop))
-        score = output.score.detach().double()
-        parts.append(Verdicts(output.inlier.numpy(), score.numpy(), output.relation.numpy()))
+        score = None if output.score is None else output.score.detach().double().numpy()
+        parts.append(Verdicts(output.inlier.numpy(), score, output.relation.numpy()))
         start = stop
-    return Verdicts(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    columns = zip(*parts, strict=True)
+    return Verdicts(*(None if values[0] is None else np.concatenate(values) for values in columns))  # type: ignore[arg-type]
 
 
 def filter_each(items: Iterable[tuple[Key, Matches]], run: MatchFilter) -> Iterator[tuple[Key, Verdicts]]:
@@ -121,9 +128,9 @@ def filter_each(items: Iterable[tuple[Key, Matches]], run: MatchFilter) -> Itera
 def _filter_block(block: list[tuple[Key, Matches]], run: MatchFilter) -> Iterator[tuple[Key, Verdicts]]:
     verdicts = filter_matches(collate_matches([matches for _, matches in block]), run)
     cuts = np.cumsum([matches.num_matches for _, matches in block])[:-1]
-    columns = (np.split(values, cuts) for values in verdicts)
-    for (key, _), inlier, score, relation in zip(block, *columns, strict=True):
-        yield key, Verdicts(inlier, score, relation)
+    columns = ([None] * len(block) if values is None else np.split(values, cuts) for values in verdicts)
+    for (key, _), *values in zip(block, *columns, strict=True):
+        yield key, Verdicts(*values)
 
 
 def check_keypoints(points: Float, describe: Callable[[int], str]) -> None:

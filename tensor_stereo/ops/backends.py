@@ -43,7 +43,18 @@ def backend() -> BackendInfo:
     return BackendInfo(name, _reason if wish == "auto" else f"TENSOR_STEREO_BACKEND is {wish!r}")
 
 
-def resolve_backend(backend: Backend) -> Backend:
+def native(backend: str) -> ModuleType | None:
+    """The compiled module where ``backend`` stands for it; None where scipy and plain torch shall run.
+
+    Every operator asks this and nothing else, so that no kernel runs under ``scipy``.
+
+    Raises:
+        ValueError: as :func:`resolve_backend`.
+    """
+    return kernels if resolve_backend(backend) == "native" else None
+
+
+def resolve_backend(backend: str) -> Backend:
     """``native`` or ``scipy`` for any allowed name.
 
     Raises:
@@ -51,11 +62,11 @@ def resolve_backend(backend: Backend) -> Backend:
     """
     source = "backend"
     if backend == "auto":
-        backend, source = os.environ.get("TENSOR_STEREO_BACKEND", "auto"), "TENSOR_STEREO_BACKEND"  # type: ignore[assignment]
+        backend, source = os.environ.get("TENSOR_STEREO_BACKEND", "auto"), "TENSOR_STEREO_BACKEND"
     if backend not in ("auto", "native", "scipy"):
         raise ValueError(f"{source} must be 'auto', 'native' or 'scipy', got {backend!r}")
     if backend == "native" and kernels is None:
         raise ValueError(f"{source} 'native' cannot run: {_reason}")
-    if backend == "auto":
-        return "scipy" if kernels is None else "native"
-    return backend
+    if backend == "scipy" or kernels is None:
+        return "scipy"
+    return "native"

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops import reference_consensus
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 
 _DIFFERENTIABLE = (0, 1, 3)  # positions of keypoints0, keypoints1 and cost
@@ -105,7 +105,8 @@ def consensus_belief(
     tolerances = tolerance_px, whole_tolerance_px, row_tolerance_px, whole_row_tolerance_px
     settings: tuple[Any, ...] = (*tolerances, slope, reach, doubt, cost_weight, num_rounds)
     graphs = crow0, cols0, crow1, cols1
-    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+    kernels = native(backend)
+    if kernels is None:
         return reference_consensus.consensus_belief(keypoints0, keypoints1, ptr, cost, *graphs, *settings)
     result = kernels.consensus_belief(
         *(_to_float64(keypoints) for keypoints in (keypoints0, keypoints1)),

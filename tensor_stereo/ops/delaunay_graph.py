@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from tensor_stereo.configs import Backend
 from tensor_stereo.delaunay.edges import delaunay_edges
 from tensor_stereo.duplicates import coincident_ids, first_of_coincident
-from tensor_stereo.ops.backends import kernels
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.ops.segments import (
     Bool,
     Float,
     Int,
-    check_options,
     group_size_of,
     one_to_one,
     pair_of,
@@ -23,6 +23,7 @@ from tensor_stereo.ops.segments import (
     to_points,
     vertices_of,
 )
+from tensor_stereo.types import check_tie_tolerance
 
 Pattern = tuple[Tensor, Tensor]  # crow (N + 1,), cols (nnz,)
 
@@ -60,14 +61,15 @@ def delaunay_graph(
         >>> delaunay_graph(points, torch.tensor([0, 4]), None, 1e-3, "auto")
         (tensor([0, 1, 3, 3, 4]), tensor([1, 0, 3, 1]))
     """
-    choice = check_options(tie_tolerance, backend)
-    points = to_points("keypoints", keypoints, ptr)
+    check_tie_tolerance(tie_tolerance)
+    kernels = native(backend)
+    points = to_points("keypoints", keypoints, ptr, kernels)
     segment = None if group is None else segments_of(ptr, group, len(points))
-    if segment is None and choice == "native":
-        kept = one_to_one([points, points], ptr, None, choice)
+    if segment is None and kernels is not None:
+        kept = one_to_one([points, points], ptr, None, kernels)
     else:
         kept = first_of_coincident(coincident_ids(points, pair_of(ptr) if segment is None else segment))
-    return _build([points], ptr, segment, kept, tie_tolerance, choice)[0]
+    return _build([points], ptr, segment, kept, tie_tolerance, kernels)[0]
 
 
 @operator(_fake_match_graphs)
@@ -99,29 +101,26 @@ def match_graphs(
         >>> match_graphs(points, points, torch.tensor([0, 4]), None, None, 1e-3, "auto")[-1]
         tensor([3, 3, 0, 3])
     """
-    choice = check_options(tie_tolerance, backend)
-    views = [to_points("keypoints0", keypoints0, ptr), to_points("keypoints1", keypoints1, ptr)]
+    check_tie_tolerance(tie_tolerance)
+    kernels = native(backend)
+    views = [to_points("keypoints0", keypoints0, ptr, kernels), to_points("keypoints1", keypoints1, ptr, kernels)]
     segment = None if group is None else segments_of(ptr, group, len(keypoints0))
-    kept = one_to_one(views, ptr, cost, choice)
-    (crow0, cols0), (crow1, cols1) = _build(views, ptr, segment, kept, tie_tolerance, choice)
+    kept = one_to_one(views, ptr, cost, kernels)
+    (crow0, cols0), (crow1, cols1) = _build(views, ptr, segment, kept, tie_tolerance, kernels)
     return crow0, cols0, crow1, cols1, group_size_of(ptr, segment, kept).to(keypoints0.device)
 
 
 def _build(
-    views: list[Float], ptr: Tensor, segment: Int | None, kept: Bool, tie_tolerance: float, backend: Backend
+    views: list[Float], ptr: Tensor, segment: Int | None, kept: Bool, tie_tolerance: float, kernels: ModuleType | None
 ) -> list[Pattern]:
     """Patterns of several point sets over the same segments; rows that are not kept are no vertices."""
     vertex, segment_ptr = vertices_of(ptr, segment, kept)
-    build = _build_native if backend == "native" else build_scipy
-    return [
-        (torch.from_numpy(crow).to(ptr.device), torch.from_numpy(cols).to(ptr.device))
-        for crow, cols in build(views, vertex, segment_ptr, tie_tolerance)
-    ]
-
-
-def _build_native(views: list[Float], vertex: Int, segment_ptr: Int, tie_tolerance: float) -> list[tuple[Int, Int]]:
-    build = kernels.delaunay_graph  # type: ignore[union-attr]  # resolve_backend has made sure that they are there
-    return [build(points, vertex, segment_ptr, tie_tolerance, torch.get_num_threads()) for points in views]
+    if kernels is None:
+        patterns = build_scipy(views, vertex, segment_ptr, tie_tolerance)
+    else:
+        settings = vertex, segment_ptr, tie_tolerance, torch.get_num_threads()
+        patterns = [kernels.delaunay_graph(points, *settings) for points in views]
+    return [(torch.from_numpy(crow).to(ptr.device), torch.from_numpy(cols).to(ptr.device)) for crow, cols in patterns]
 
 
 def build_scipy(views: list[Float], vertex: Int, segment_ptr: Int, tie_tolerance: float) -> list[tuple[Int, Int]]:

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from tensor_stereo.delaunay.critical import critical_points
 from tensor_stereo.duplicates import coincident_ids, first_of_coincident
-from tensor_stereo.ops.backends import kernels
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
-from tensor_stereo.ops.segments import check_options, pair_of, segments_of, to_points, vertices_of
+from tensor_stereo.ops.segments import pair_of, segments_of, to_points, vertices_of
 from tensor_stereo.types import check_pairs
 
 
@@ -40,8 +40,8 @@ def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, p
         >>> dual_critical_points(points, torch.tensor([0, 4]), None, torch.tensor([[0, 1]]), "auto")
         tensor([[3, 2]])
     """
-    choice = check_options(0.0, backend)
-    points = to_points("keypoints", keypoints, ptr)
+    kernels = native(backend)
+    points = to_points("keypoints", keypoints, ptr, kernels)
     check_pairs("pairs", pairs, len(points))
     rows = pairs.numpy(force=True)
     segment = pair_of(ptr) if group is None else segments_of(ptr, group, len(points))
@@ -55,7 +55,7 @@ def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, p
     order = np.argsort(number, kind="stable")
     counts = np.bincount(number, minlength=len(segment_ptr) - 1)
     pair_ptr = np.concatenate([[0], np.cumsum(counts)])
-    if choice == "native" and kernels is not None:
+    if kernels is not None:
         threads = torch.get_num_threads()
         found = kernels.dual_critical_points(points, vertex, segment_ptr, rows[order], pair_ptr, threads)
     else:

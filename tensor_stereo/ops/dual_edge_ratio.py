@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops import reference
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator, refuse_second_derivative
 
 
@@ -28,7 +28,8 @@ def dual_edge_ratio_backward(
         >>> dual_edge_ratio_backward(points, pairs, critical, ptr, torch.ones(1).double(), 9.0, "auto")[2]
         tensor([0.0000, 0.5000], dtype=torch.float64)
     """
-    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+    kernels = native(backend)
+    if kernels is None:
         return reference.dual_edge_ratio_backward(points, pairs, critical, gradient, bound)
     arrays = (t.contiguous().numpy(force=True) for t in (points, pairs, critical, pair_ptr, gradient))
     result = kernels.dual_edge_ratio_backward(*arrays, bound, torch.get_num_threads())
@@ -74,7 +75,8 @@ def dual_edge_ratio(
         >>> dual_edge_ratio(points, pairs, critical, torch.tensor([0, 2]), 9.0, "auto")
         tensor([9., 0.], dtype=torch.float64)
     """
-    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+    kernels = native(backend)
+    if kernels is None:
         return reference.dual_edge_ratio(points, pairs, critical, bound)
     arrays = (t.contiguous().numpy(force=True) for t in (points, pairs, critical, pair_ptr))
     return torch.from_numpy(kernels.dual_edge_ratio(*arrays, bound, torch.get_num_threads())).to(points.device)

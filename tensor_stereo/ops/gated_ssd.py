@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tensor_stereo.configs import MatchingConfig
 from tensor_stereo.ops import reference
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import Features
 
@@ -62,7 +62,8 @@ def gated_ssd(
         >>> gated_ssd(points, points - 2, windows, windows, ptr, ptr, 2.0, 0.0, 3.0, "auto")[1]
         tensor([0, 1])
     """
-    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+    kernels = native(backend)
+    if kernels is None:
         config = MatchingConfig(
             max_row_offset_px=max_row_offset_px, min_disparity_px=min_disparity_px, max_disparity_px=max_disparity_px
         )

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.delaunay import predicates
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import check_points, check_rows
 
@@ -65,6 +65,5 @@ def _signs(name: str, points: tuple[Tensor, ...], backend: str) -> Tensor:
         if values.dtype != torch.float64:
             raise TypeError(f"{letter} must be float64, got {values.dtype}")
     arrays = [values.contiguous().numpy(force=True) for values in points]
-    native = resolve_backend(backend) == "native"  # type: ignore[arg-type]
-    signs = getattr(kernels if native else predicates, name)(*arrays)
+    signs = getattr(native(backend) or predicates, name)(*arrays)
     return torch.from_numpy(signs).to(points[0].device)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops import reference
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 
 
@@ -43,7 +43,8 @@ def relate(
         >>> relate(one, torch.tensor([1, 1, 3, 2]), torch.tensor([1, 2, 2, 3]), size, 4, True, "auto")[0].tolist()
         [1, 2, 3, 4]
     """
-    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+    kernels = native(backend)
+    if kernels is None:
         return reference.relate(overlap, degree0, degree1, group_size, min_group_size, accept_subsets)
     arrays = (t.contiguous().numpy(force=True) for t in (overlap, degree0, degree1, group_size))
     relation, inlier = kernels.relate(*arrays, min_group_size, accept_subsets)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops import reference
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 
 
@@ -36,7 +36,8 @@ def row_overlap(
         >>> row_overlap(crow, torch.tensor([0, 1, 1]), crow, torch.tensor([1, 2, 0]), "auto")[0]
         tensor([1, 0])
     """
-    if resolve_backend(backend) == "scipy" or kernels is None:  # type: ignore[arg-type]
+    kernels = native(backend)
+    if kernels is None:
         return reference.row_overlap(crow0, cols0, crow1, cols1)
     arrays = (t.numpy(force=True) for t in (crow0, cols0, crow1, cols1))
     results = kernels.row_overlap(*arrays, torch.get_num_threads())

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tensor_stereo.configs import Backend
 from tensor_stereo.duplicates import coincident_ids, keep_one_to_one
-from tensor_stereo.ops.backends import kernels, resolve_backend
-from tensor_stereo.types import check_integer, check_points, check_ptr, check_tie_tolerance, check_vector
+from tensor_stereo.types import check_integer, check_points, check_ptr, check_vector
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -32,24 +32,18 @@ def segments_of(ptr: Tensor, group: Tensor, num_rows: int) -> Int:
     return segment
 
 
-def check_options(tie_tolerance: float, backend: str) -> Backend:
-    """The back end that shall run; raises for unknown options."""
-    check_tie_tolerance(tie_tolerance)
-    return resolve_backend(backend)  # type: ignore[arg-type]
-
-
 def pair_of(ptr: Tensor) -> Int:
     """(M,) number of the pair of every row."""
     length = np.diff(ptr.numpy(force=True))
     return np.repeat(np.arange(len(length)), length)
 
 
-def to_points(name: str, keypoints: Tensor, ptr: Tensor) -> Float:
+def to_points(name: str, keypoints: Tensor, ptr: Tensor, kernels: ModuleType | None = None) -> Float:
     """Keypoints as a float64 array; raises for what the exact predicates cannot take, naming pair and row."""
     check_points(name, keypoints)
     check_ptr("ptr", ptr, len(keypoints))
     points: Float = keypoints.detach().to("cpu", torch.float64).contiguous().numpy()
-    row = _first_out_of_range(points)
+    row = _first_out_of_range(points, kernels)
     if row >= 0:
         pair = int(torch.searchsorted(ptr.cpu(), row, right=True)) - 1
         where = f"row {row - int(ptr[pair])} of pair {pair}"
@@ -58,7 +52,7 @@ def to_points(name: str, keypoints: Tensor, ptr: Tensor) -> Float:
     return points
 
 
-def _first_out_of_range(points: Float) -> int:
+def _first_out_of_range(points: Float, kernels: ModuleType | None) -> int:
     if kernels is not None:
         return int(kernels.first_point_out_of_range(points))
     magnitude = np.abs(points)
@@ -66,13 +60,13 @@ def _first_out_of_range(points: Float) -> int:
     return int(bad.argmax()) if bad.any() else -1
 
 
-def one_to_one(views: list[Float], ptr: Tensor, cost: Tensor | None, backend: Backend) -> Bool:
+def one_to_one(views: list[Float], ptr: Tensor, cost: Tensor | None, kernels: ModuleType | None) -> Bool:
     """(M,) the rows that are vertices, as :func:`tensor_stereo.graphs.build_match_graphs` documents them."""
     values = None if cost is None else cost.detach().to("cpu", torch.float64).contiguous().numpy()
     if values is not None and np.isnan(values).any():
         raise ValueError(f"cost must not be NaN, got NaN in row {int(np.isnan(values).argmax())}")
     kept: Bool
-    if backend == "native" and kernels is not None:
+    if kernels is not None:
         kept = kernels.one_to_one(*views, ptr.numpy(force=True), values, torch.get_num_threads())
         return kept
     pair = pair_of(ptr)

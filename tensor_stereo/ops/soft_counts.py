@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tensor_stereo.ops.backends import kernels, resolve_backend
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator, refuse_second_derivative
 
 Gradients = tuple[Tensor, Tensor, Tensor]
@@ -40,11 +40,12 @@ def soft_counts_backward(
         >>> points, ptr = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.0, 2.0]]).double(), torch.tensor([0, 1])
         >>> pairs, critical, edge = torch.tensor([[0, 1]]), torch.tensor([[-1, 2]]), torch.tensor([True])
         >>> views = (points, points, pairs, critical, critical, edge, edge, ptr, torch.ones(()).double())
-        >>> if kernels is not None:
+        >>> from tensor_stereo.ops import backend
+        >>> if backend().name == "native":
         ...     of_points0, _, _ = soft_counts_backward(*views, 40.0, False, 1.0, torch.ones(3, 3).double())
         ...     assert of_points0.shape == (3, 2)
     """
-    resolve_backend("native")
+    kernels = native("native")
     arrays = _arrays(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, pair_ptr, gradient)
     of_points0, of_points1, of_temperature = kernels.soft_counts_backward(  # type: ignore[union-attr]
         *arrays, temperature.detach().item(), saturation, in_px, bound, torch.get_num_threads()
@@ -111,10 +112,11 @@ def soft_counts(
         >>> points, ptr = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.0, 1.0]]).double(), torch.tensor([0, 1])
         >>> pairs, critical, edge = torch.tensor([[0, 1]]), torch.tensor([[-1, 2]]), torch.tensor([True])
         >>> views = (points, points, pairs, critical, critical, edge, edge, ptr, torch.ones(()).double())
-        >>> if kernels is not None:
+        >>> from tensor_stereo.ops import backend
+        >>> if backend().name == "native":
         ...     assert soft_counts(*views, 40.0, False, 100.0)[:, 0].tolist() == [1.0, 1.0, 0.0]
     """
-    resolve_backend("native")
+    kernels = native("native")
     arrays = _arrays(points0, points1, pairs, critical0, critical1, is_edge0, is_edge1, pair_ptr)
     counts = kernels.soft_counts(  # type: ignore[union-attr]
         *arrays, temperature.detach().item(), saturation, in_px, bound, torch.get_num_threads()

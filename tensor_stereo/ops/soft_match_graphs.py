@@ -9,20 +9,20 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.delaunay.critical import critical_points, limit_reach, soft_pairs
-from tensor_stereo.ops.backends import kernels
+from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.delaunay_graph import build_scipy
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.ops.segments import (
     Bool,
     Float,
     Int,
-    check_options,
     group_size_of,
     one_to_one,
     segments_of,
     to_points,
     vertices_of,
 )
+from tensor_stereo.types import check_tie_tolerance
 
 Found = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -80,13 +80,14 @@ def soft_match_graphs(
         >>> found[5].tolist(), found[9].tolist()  # both diagonals count, neither is an edge
         ([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], [True, False, True, True, False, True])
     """
-    choice = check_options(tie_tolerance, backend)
+    check_tie_tolerance(tie_tolerance)
+    kernels = native(backend)
     edge_lengths, px = reach.tolist()
-    views = [to_points("keypoints0", keypoints0, ptr), to_points("keypoints1", keypoints1, ptr)]
+    views = [to_points("keypoints0", keypoints0, ptr, kernels), to_points("keypoints1", keypoints1, ptr, kernels)]
     segment = None if group is None else segments_of(ptr, group, len(keypoints0))
-    kept = one_to_one(views, ptr, cost, choice)
+    kept = one_to_one(views, ptr, cost, kernels)
     vertex, segment_ptr = vertices_of(ptr, segment, kept)
-    if choice == "native" and kernels is not None:
+    if kernels is not None:
         threads = torch.get_num_threads()
         found = kernels.soft_match_graphs(*views, vertex, segment_ptr, tie_tolerance, edge_lengths, px, threads)
     else:

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tensor_stereo.configs import EvaluationConfig, describe_verdict
+from tensor_stereo.configs import EvaluationConfig, describe_settings
 from tensor_stereo.evaluation import PairEvaluation
 from tensor_stereo.features import to_gray
 from tensor_stereo.metrics import IsolatedCounts
@@ -39,8 +39,8 @@ def write_evaluation(
         out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.
 
     Returns:
-        Tables 1-4 for the detectors of ``config``, how the score ranks matches, Table 5, run-time by stage, putative
-        matches and isolated ones.
+        Tables 1-4 for the detectors of ``config``, with the verdict of the score beside those of the paper; how the
+        score ranks matches; Table 5, run-time by stage, putative matches and isolated ones.
 
     Raises:
         ValueError: if ``out`` holds the results of other settings.
@@ -63,22 +63,27 @@ def write_evaluation(
 
 
 def draw_evaluation(result: PairEvaluation, config: EvaluationConfig, path: Path) -> None:
-    """Draw the constrained variant of one pair and detector."""
-    constrained = next(t for t in reversed(result.trials) if t.config.restriction == config.restriction)
+    """Draw the verdict of the score, if there is one, and that of the paper, constrained by objects, on one pair."""
+    paper = next(t for t in reversed(result.trials) if t.config.verdict == config.restriction)
     pair = result.pair
     contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in (pair.image0, pair.image1)]
+    verdicts = {
+        describe_settings(trial.config): trial.classification.inlier
+        for trial in result.trials
+        if trial.config.verdict == "score"
+    }
     figure = draw_classification(
         pair.image0,
         pair.image1,
-        constrained.matches,
-        constrained.classification,
-        constrained.graphs.adjacency0,
-        constrained.graphs.adjacency1,
-        correct=constrained.correct,
-        valid=constrained.valid,
+        paper.matches,
+        verdicts | {f"{describe_settings(paper.config)}, constrained by objects": paper.classification.inlier},
+        paper.graphs.adjacency0,
+        paper.graphs.adjacency1,
+        correct=paper.correct,
+        valid=paper.valid,
         contours0=contours[0],
         contours1=contours[1],
-        title=f"{pair.name}, {result.detector.upper()}, {describe_verdict(vars(config))}, constrained by objects",
+        title=f"{pair.name}, {result.detector.upper()}",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_figure(figure, path)

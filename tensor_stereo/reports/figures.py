@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from tensor_stereo.types import Adjacency, Classification, Matches, Relation, check_vector
+from tensor_stereo.types import Adjacency, Matches, check_vector
 
 # hues that stay apart for the common colour blindnesses (Okabe & Ito, 2008)
 BLUE, VERMILLION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#595959"
@@ -56,17 +56,18 @@ def draw_classification(
     image0: Tensor,
     image1: Tensor,
     matches: Matches,
-    classification: Classification,
+    verdicts: Mapping[str, Tensor],
     adjacency0: Adjacency,
     adjacency1: Adjacency,
     *,
+    tested: Tensor | None = None,
     correct: Tensor | None = None,
     valid: Tensor | None = None,
     contours0: Sequence[Tensor] | None = None,
     contours1: Sequence[Tensor] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw one pair: above its matches by verdict and truth, below the Delaunay graphs of both views.
+    """Draw one pair: its matches by verdict and truth, a row for each verdict, and below the graphs of both views.
 
     The marker is the verdict, a disc for kept and a cross for rejected; the colour is the truth, blue for correct,
     vermillion for incorrect, grey for unknown. Without ground truth the classes are kept, rejected and untested. Edges
@@ -76,9 +77,10 @@ def draw_classification(
         image0: (C, H, W) uint8 of view 0, C = 1 or 3 (RGB); drawn in grey so that colours mean matches only.
         image1: (C, H, W) uint8 of view 1.
         matches: M matches of one pair.
-        classification: their verdicts.
+        verdicts: (M,) bool, True for kept, by the name of what decided; one or several, from top to bottom.
         adjacency0: graph of view 0 over the M matches.
         adjacency1: graph of view 1.
+        tested: (M,) bool, False for matches without evidence, which are told apart where there is no ground truth.
         correct: (M,) bool against ground truth, together with ``valid``.
         valid: (M,) bool, ground truth is known.
         contours0: (L, 2) chains of pixels (x, y) of view 0, as :func:`tensor_stereo.objects.trace_objects` gives them.
@@ -97,27 +99,29 @@ def draw_classification(
         >>> image, points = torch.zeros(1, 20, 30, dtype=torch.uint8), torch.tensor([[3.0, 4.0]])
         >>> one, none = torch.ones(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
         >>> graph = Adjacency(torch.zeros(2, dtype=torch.int64), none, torch.tensor([0, 1]))
-        >>> verdict = Classification(one > 0, one.to(torch.int8), one, one, one)
-        >>> matches = Matches(points, points, torch.tensor([0, 1]))
-        >>> len(draw_classification(image, image, matches, verdict, graph, graph).axes)
+        >>> matches, kept = Matches(points, points, torch.tensor([0, 1])), one > 0
+        >>> len(draw_classification(image, image, matches, {"score": kept}, graph, graph).axes)
         4
     """
     _check_pair(image0, image1, matches)
     for name, adjacency in (("adjacency0", adjacency0), ("adjacency1", adjacency1)):
         if adjacency.num_nodes != matches.num_matches:
             raise ValueError(f"{name} must have {matches.num_matches} nodes, one per match, got {adjacency.num_nodes}")
-    classes = _classes(classification, correct, valid, matches.num_matches)
+    if not verdicts:
+        raise ValueError("verdicts must hold at least one")
+    rows = [_classes(inlier, tested, correct, valid, matches.num_matches) for inlier in verdicts.values()]
     keypoints = [points.numpy(force=True) for points in (matches.keypoints0, matches.keypoints1)]
     edges = [_edges(adjacency0), _edges(adjacency1)]
     shared = [np.isin(edges[view], edges[1 - view]) for view in (0, 1)]
 
-    layout = _Layout(image0, title, num_rows=2)
+    layout = _Layout(image0, title, num_rows=len(rows) + 1)
     for view, (image, contours) in enumerate(((image0, contours0), (image1, contours1))):
         gray = _gray(image)
-        layout.draw_matches(view, gray, classes, keypoints[view])
+        for row, (name, classes) in enumerate(zip(verdicts, rows, strict=True)):
+            layout.draw_matches(row, view, gray, classes, keypoints[view], name)
         num_edges, num_shared = len(edges[view]), int(shared[view].sum())
         label = f"Delaunay graph of view {view}: {num_edges} edges, {num_shared} of them in both views"
-        lower = layout.panel(1, view, label, gray, strength=0.25)
+        lower = layout.panel(len(rows), view, label, gray, strength=0.25)
         if contours is not None:
             _draw_lines(lower, [_closed(contour.numpy(force=True)) for contour in contours], GREEN, 1.6)
         ends = np.stack(np.divmod(edges[view], matches.num_matches), 1)
@@ -125,11 +129,14 @@ def draw_classification(
         _draw_lines(lower, segments[~shared[view]], VERMILLION, 0.6)
         _draw_lines(lower, segments[shared[view]], BLUE, 0.9)
         lower.plot(*keypoints[view].T, linestyle="none", marker=".", markersize=2.5, color="black")
-    layout.legend(0, [item.handle() for item in classes])
+    for row, classes in enumerate(rows):
+        layout.legend(row, [item.handle() for item in classes])
     lines = {"edge in both views": BLUE, "edge in one view only": VERMILLION}
     if contours0 is not None or contours1 is not None:
         lines["object contour"] = GREEN
-    layout.legend(1, [Line2D([], [], color=color, linewidth=1.5, label=label) for label, color in lines.items()])
+    layout.legend(
+        len(rows), [Line2D([], [], color=color, linewidth=1.5, label=label) for label, color in lines.items()]
+    )
     return layout.figure
 
 
@@ -157,7 +164,7 @@ def draw_matches(
     classes = _truth_classes(inlier, correct, valid, matches.num_matches)
     layout = _Layout(image0, title, num_rows=1)
     for view, (image, points) in enumerate(((image0, matches.keypoints0), (image1, matches.keypoints1))):
-        layout.draw_matches(view, _gray(image), classes, points.numpy(force=True))
+        layout.draw_matches(0, view, _gray(image), classes, points.numpy(force=True))
     layout.legend(0, [item.handle() for item in classes])
     return layout.figure
 
@@ -237,9 +244,16 @@ class _Layout:
         return axes
 
     def draw_matches(
-        self, view: int, gray: NDArray[np.uint8], classes: Sequence[_Class], keypoints: NDArray[np.floating]
+        self,
+        row: int,
+        view: int,
+        gray: NDArray[np.uint8],
+        classes: Sequence[_Class],
+        keypoints: NDArray[np.floating],
+        name: str = "",
     ) -> None:
-        axes = self.panel(0, view, f"view {view} ({('left', 'right')[view]})", gray, strength=0.5)
+        where = f"view {view} ({('left', 'right')[view]})"
+        axes = self.panel(row, view, f"{name}: {where}" if name else where, gray, strength=0.5)
         for item in reversed(classes):  # the first on top
             item.draw(axes, keypoints)
 
@@ -257,21 +271,24 @@ class _Layout:
 
 
 def _classes(
-    classification: Classification, correct: Tensor | None, valid: Tensor | None, num_matches: int
+    inlier: Tensor, tested: Tensor | None, correct: Tensor | None, valid: Tensor | None, num_matches: int
 ) -> list[_Class]:
     """How the matches are told apart, the errors that matter most first."""
     if correct is None and valid is None:
-        check_vector("classification.inlier", classification.inlier, num_matches)
-        kept: NDArray[np.bool_] = classification.inlier.numpy(force=True)
-        untested = classification.relation.numpy(force=True) == Relation.UNTESTED
+        check_vector("verdicts", inlier, num_matches)
+        kept: NDArray[np.bool_] = inlier.numpy(force=True)
+        known: NDArray[np.bool_] = np.ones(num_matches, np.bool_)
+        if tested is not None:
+            check_vector("tested", tested, num_matches)
+            known = tested.numpy(force=True)
         return [
             _Class("kept", kept, BLUE, "o"),
-            _Class("rejected", ~kept & ~untested, VERMILLION, "x"),
-            _Class("untested", untested, GREY, "x"),
+            _Class("rejected", ~kept & known, VERMILLION, "x"),
+            _Class("untested", ~known, GREY, "x"),
         ]
     if correct is None or valid is None:
         raise ValueError("correct and valid must be given together, got only one of them")
-    return _truth_classes(classification.inlier, correct, valid, num_matches)
+    return _truth_classes(inlier, correct, valid, num_matches)
 
 
 def _truth_classes(inlier: Tensor, correct: Tensor, valid: Tensor, num_matches: int) -> list[_Class]:

@@ -9,9 +9,10 @@ import polars as pl
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tensor_stereo.configs import PipelineConfig, describe_verdict
+from tensor_stereo.configs import PipelineConfig, describe_settings
 from tensor_stereo.datasets import PairFiles, read_pair
 from tensor_stereo.features import to_gray
+from tensor_stereo.filters import verdicts_by_name
 from tensor_stereo.metrics import Rates, match_rates, matches_against_gt
 from tensor_stereo.objects import trace_objects
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
@@ -24,40 +25,56 @@ ENDINGS = (".csv", ".parquet")
 
 @dataclass(frozen=True)
 class MatchSummary:
-    """Counts over the matches of one pair, and the rates if ground truth is given."""
+    """Counts over the matches of one pair, and the rates if ground truth is given.
+
+    Attributes:
+        num_matches: Putative matches.
+        num_kept: Those that the verdict of the settings keeps.
+        num_rejected: Those that it rejects on evidence.
+        num_untested: Those without evidence, which it rejects too.
+        kept_by: What each verdict keeps: ``adjacency``, ``cardinality``, and ``score`` if there is one that can decide.
+        rates: Of the verdict of the settings against ground truth, or None.
+    """
 
     num_matches: int
     num_kept: int
     num_rejected: int
     num_untested: int
+    kept_by: dict[str, int]
     rates: Rates | None = None
 
 
 def classify_files(
-    left: Path,
-    right: Path,
-    config: PipelineConfig,
+    left: Path | str,
+    right: Path | str,
+    config: PipelineConfig | None = None,
     *,
-    disparity_gt: Path | None = None,
+    disparity_gt: Path | str | None = None,
     gt_scale: float | None = None,
-    out: Path | None = None,
-    figure: Path | None = None,
+    out: Path | str | None = None,
+    figure: Path | str | None = None,
 ) -> MatchSummary:
-    """Run the pipeline on two image files.
+    """Match two image files of a rectified pair and decide which matches are right.
 
     Args:
-        left: image of view 0.
-        right: image of view 1, of the same size.
-        config: settings of every step.
-        disparity_gt: ground truth of view 0, PFM or PNG.
-        gt_scale: stored value / px of disparity in a PNG map.
-        out: .csv or .parquet file for :func:`match_table`.
-        figure: PNG file for both views, their matches and graphs.
+        left: Image of view 0.
+        right: Image of view 1, of the same size.
+        config: Settings of every step; None means the defaults.
+        disparity_gt: Ground truth of view 0, PFM or PNG.
+        gt_scale: Stored value / px of disparity in a PNG map.
+        out: File .csv or .parquet for :func:`match_table`.
+        figure: File .png for both views, their matches by every verdict that decides, and their graphs.
+
+    Returns:
+        How many matches each verdict keeps.
 
     Raises:
         ValueError: for damaged images, views of different size, or another ending of ``out`` or ``figure``.
         FileNotFoundError: if a file or the folder of a result is missing.
     """
+    config = config or PipelineConfig()
+    left, right = Path(left), Path(right)
+    disparity_gt, out, figure = (None if path is None else Path(path) for path in (disparity_gt, out, figure))
     if out is not None and out.suffix not in ENDINGS:
         raise ValueError(f"out must end in {' or '.join(ENDINGS)}, got {out.name!r}")
     if figure is not None and figure.suffix != ".png":
@@ -69,7 +86,7 @@ def classify_files(
     output = run_pipeline([(pair.image0, pair.image1)], config)
     truth = None if pair.disparity_gt is None else matches_against_gt(output.matches, [pair.disparity_gt])
     if out is not None:
-        table = match_table(output, truth)
+        table = match_table(output, config, truth)
         table.write_csv(out) if out.suffix == ".csv" else table.write_parquet(out)
     if figure is not None:
         write_figure(_draw(pair, output, config, truth), figure)
@@ -81,16 +98,19 @@ def classify_files(
         num_kept=num_kept,
         num_rejected=output.matches.num_matches - num_kept - num_untested,
         num_untested=num_untested,
+        kept_by={name: int(kept.sum()) for name, kept in _verdicts(output, config).items()},
         rates=None if truth is None else match_rates(verdict.inlier, *truth),
     )
 
 
-def match_table(output: PipelineOutput, truth: Truth | None = None) -> pl.DataFrame:
+def match_table(output: PipelineOutput, config: PipelineConfig, truth: Truth | None = None) -> pl.DataFrame:
     """One row per match of one pair.
 
-    Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained, ``inlier``, ``score``
-    if there is one, ``relation`` by name, ``overlap, degree0, degree1``, and with ``truth`` = (correct, valid) also
-    ``correct``, null where ground truth is not known.
+    Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained; ``inlier``, what the
+    verdict of the settings says; ``probability`` of an error of at most 1 px, or ``score`` where that is none;
+    ``inlier_adjacency``, ``inlier_cardinality`` and, if there is a score that can decide, ``inlier_score``;
+    ``relation`` by name, ``overlap, degree0, degree1``; and with ``truth`` = (correct, valid) also ``correct``, null
+    where ground truth is not known.
     """
     matches, verdict = output.matches, output.classification
     columns = {
@@ -102,7 +122,8 @@ def match_table(output: PipelineOutput, truth: Truth | None = None) -> pl.DataFr
         "cost": matches.cost,
         "group": matches.group,
         "inlier": verdict.inlier,
-        "score": output.score,
+        "probability" if config.is_probability else "score": output.score,
+        **{f"inlier_{name}": kept for name, kept in _verdicts(output, config).items()},
         "relation": verdict.relation,
         "overlap": verdict.overlap,
         "degree0": verdict.degree0,
@@ -117,19 +138,28 @@ def match_table(output: PipelineOutput, truth: Truth | None = None) -> pl.DataFr
     return table.with_columns(pl.when(valid).then(correct).alias("correct"))
 
 
+def _verdicts(output: PipelineOutput, config: PipelineConfig) -> dict[str, Tensor]:
+    return verdicts_by_name(output.classification, output.score, config)
+
+
 def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, truth: Truth | None) -> Figure:
     correct, valid = truth if truth is not None else (None, None)
     images = pair.image0, pair.image1
+    verdicts = _verdicts(output, config)
+    shown = {describe_settings(config): output.classification.inlier}
+    if config.verdict == "score":
+        shown["cardinality"] = verdicts["cardinality"]
     contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in images if config.constrained]
     return draw_classification(
         *images,
         output.matches,
-        output.classification,
+        shown,
         output.graphs.adjacency0,
         output.graphs.adjacency1,
+        tested=output.classification.relation != Relation.UNTESTED,
         correct=correct,
         valid=valid,
         contours0=contours[0] if contours else None,
         contours1=contours[1] if contours else None,
-        title=f"{pair.name}, {config.detector.upper()}, {describe_verdict(vars(config))}",
+        title=f"{pair.name}, {config.detector.upper()}",
     )

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tensor_stereo.configs import DETECTORS, Restriction, describe_verdict
+from tensor_stereo.configs import DETECTORS, VERDICTS, Restriction, Verdict, describe_verdict
 
 Row = Mapping[str, Any]
 Cell = str | int | float
@@ -56,9 +56,9 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
     """All tables for the detectors that the records name.
 
     Args:
-        rows: one record per scene, detector, variant and restriction, as
+        rows: one record per scene, detector, variant and verdict, as
             :func:`tensor_stereo.evaluation.score_dataset` documents them; None in place of a number means NaN.
-        restriction: the one whose records are shown.
+        restriction: The one of the paper whose records are shown, beside those of the score.
 
     Returns:
         Tables 1-4 as far as there are records, how the score ranks matches if there is one, Table 5, the run-time by
@@ -71,7 +71,7 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
         >>> [table.title for table in paper_tables([])]  # doctest: +ELLIPSIS
         ['Table 5. Run-time...', 'Run-time by stage...', 'Putative matches...']
     """
-    scores = [score_table(rows, restriction=restriction)]
+    scores = [score_table(rows)]
     return [
         *(rates_table(rows, detector, restriction=restriction) for detector in _detectors(_index(rows, restriction))),
         *(table for table in scores if table.rows),
@@ -84,42 +84,50 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
 def rates_table(rows: Sequence[Row], detector: str, *, restriction: Restriction = "cardinality") -> Table:
     """One of Tables 1-4: scenes x (sensitivity, specificity, PPV, NPV), without and with Restriction 3.
 
-    The last row is the mean over the scenes; undefined rates are left out of it.
+    Where there are records of it, the verdict of the score on all matches stands beside them. The last row is the mean
+    over the scenes; undefined rates are left out of it.
 
     Example:
-        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", verdict="cardinality")
         >>> record |= dict(sensitivity=0.875, specificity=0.5, ppv=0.25, npv=float("nan"))
         >>> rates_table([record], "fast").text_rows()[0][5:]
         ['0.88', '0.50', '0.25', '–']
     """
     if detector not in DETECTORS:
         raise ValueError(f"detector must be one of {', '.join(DETECTORS)}, got {detector!r}")
-    records = _index(rows, restriction)
-    scenes = _scenes(key for key in records if key[1] == detector)
-    keys = [(variant, rate) for variant in VARIANTS for rate in RATES]
+    paper, scored = _index(rows, restriction), _index(rows, "score")
+    groups = {"unconstrained (U)": (paper, "unconstrained"), "constrained by objects (C)": (paper, "constrained")}
+    by_score = [key for key in scored if key[1:] == (detector, "unconstrained")]
+    if by_score:
+        groups[f"{describe_verdict(scored[by_score[0]])} (S)"] = (scored, "unconstrained")
+    scenes = _scenes(key for records in (paper, scored) for key in records if key[1] == detector)
+    keys = [(records, variant, rate) for records, variant in groups.values() for rate in RATES]
     body = [
-        (scene, *(_value(records.get((scene, detector, variant)), rate) for variant, rate in keys)) for scene in scenes
+        (scene, *(_value(records.get((scene, detector, variant)), rate) for records, variant, rate in keys))
+        for scene in scenes
     ]
-    head = f"Table {DETECTORS.index(detector) + 1}. {detector.upper()}, {_verdict(records, restriction)}"
+    letters = [title[-2] for title in groups]
     return Table(
-        title=f"{head}: unconstrained (U) and constrained by objects (C)",
-        columns=("scene", *(f"{variant[0].upper()} {RATES[rate]}" for variant, rate in keys)),
+        title=f"Table {DETECTORS.index(detector) + 1}. {detector.upper()}, {restriction}: {', '.join(groups)}",
+        columns=("scene", *(f"{letter} {heading}" for letter in letters for heading in RATES.values())),
         rows=_with_mean(body),
     )
 
 
-def score_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
+def score_table(rows: Sequence[Row]) -> Table:
     """How the score ranks matches: area under the ROC curve, and specificity where the paper reads it.
 
-    Two rows per detector, without and with Restriction 3, as means over the scenes; none without a score.
+    One row per detector and variant with a score, as means over the scenes.
 
     Example:
-        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> record = dict(scene="Art", detector="fast", variant="unconstrained", verdict="score")
         >>> record |= dict(score="consensus", auc=0.9, specificity_at_sensitivity_96=0.5)
         >>> score_table([record]).text_rows()
-        [['FAST, constrained', '1', '0.900', '0.500']]
+        [['FAST, unconstrained', '1', '0.900', '0.500']]
     """
-    records = {key: row for key, row in _index(rows, restriction).items() if row.get("auc") is not None}
+    records: dict[Key, Row] = {}  # the score is the same under every verdict
+    for verdict in VERDICTS:
+        records |= {key: row for key, row in _index(rows, verdict).items() if row.get("auc") is not None}
     body: list[tuple[Cell, ...]] = []
     for detector in _detectors(records):
         for variant in VARIANTS:
@@ -136,12 +144,12 @@ def runtime_table(rows: Sequence[Row], *, restriction: Restriction = "cardinalit
     """Table 5: run-time of the constrained variant, all stages together, in ms per scene and detector.
 
     Example:
-        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", verdict="cardinality")
         >>> runtime_table([record | {"seconds": {"detect": 0.01, "match": 0.02}}]).text_rows()[0]
         ['Art', '30.0']
     """
     records = _index_variant(rows, restriction, "constrained")
-    title = f"Table 5. Run-time of the constrained variant in ms, {_verdict(records, restriction)}"
+    title = f"Table 5. Run-time of the constrained variant in ms, {restriction}"
     milliseconds = {key: 1000 * sum(_field(record, "seconds").values()) for key, record in records.items()}
     detectors = _detectors(records)
     body = [
@@ -155,7 +163,7 @@ def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality"
     """Run-time of the constrained variant by stage, in ms per detector, as the mean over the scenes.
 
     Example:
-        >>> record = dict(scene="Art", detector="fast", variant="constrained", restriction="cardinality")
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", verdict="cardinality")
         >>> stage_table([record | {"seconds": {"detect": 0.01, "match": 0.02}}]).text_rows()
         [['FAST', '10.0', '20.0', '30.0']]
     """
@@ -168,8 +176,7 @@ def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality"
         means = [1000 * _mean([scene.get(stage, math.nan) for scene in seconds]) for stage in stages]
         total = 1000 * _mean([sum(scene.values()) for scene in seconds])
         body.append((detector.upper(), *means, total))
-    verdict = _verdict(records, restriction)
-    title = f"Run-time by stage of the constrained variant in ms, {verdict}, mean over the scenes"
+    title = f"Run-time by stage of the constrained variant in ms, {restriction}, mean over the scenes"
     return Table(title, ("detector", *stages, "total"), tuple(body), decimals=1)
 
 
@@ -177,7 +184,7 @@ def matches_table(rows: Sequence[Row], *, restriction: Restriction = "cardinalit
     """What the detectors offer: putative matches, and the fraction of them that is estimated incorrectly.
 
     Example:
-        >>> record = dict(scene="Art", detector="fast", variant="unconstrained", restriction="cardinality")
+        >>> record = dict(scene="Art", detector="fast", variant="unconstrained", verdict="cardinality")
         >>> matches_table([record | dict(num_matches=700, num_valid=690, fraction_incorrect=0.55)]).text_rows()[0]
         ['Art', '700', '0.55']
     """
@@ -216,8 +223,8 @@ def to_markdown(table: Table) -> str:
     return "\n".join([f"**{table.title}**", "", header, f"|{rule}|", *body]) + "\n"
 
 
-def _index(rows: Sequence[Row], restriction: Restriction) -> dict[Key, Row]:
-    """Records of one restriction by (scene, detector, variant)."""
+def _index(rows: Sequence[Row], verdict: Verdict) -> dict[Key, Row]:
+    """Records of one verdict by (scene, detector, variant)."""
     index: dict[Key, Row] = {}
     for row in rows:
         scene, detector, variant = (_field(row, name) for name in ("scene", "detector", "variant"))
@@ -225,24 +232,17 @@ def _index(rows: Sequence[Row], restriction: Restriction) -> dict[Key, Row]:
             raise ValueError(f"detector must be one of {', '.join(DETECTORS)}, got {detector!r}")
         if variant not in VARIANTS:
             raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
-        if _field(row, "restriction") != restriction:
+        if _field(row, "verdict") != verdict:
             continue
         key = _display_name(scene), detector, variant
         if key in index:
-            raise ValueError(
-                f"rows must not repeat a record, got {scene!r}, {detector}, {variant}, {restriction} twice"
-            )
+            raise ValueError(f"rows must not repeat a record, got {scene!r}, {detector}, {variant}, {verdict} twice")
         index[key] = row
     return index
 
 
 def _index_variant(rows: Sequence[Row], restriction: Restriction, variant: str) -> dict[Key, Row]:
     return {key: record for key, record in _index(rows, restriction).items() if key[2] == variant}
-
-
-def _verdict(records: Mapping[Key, Row], restriction: Restriction) -> str:
-    """What decided in the records of one evaluation, which agree about it."""
-    return next((describe_verdict(row) for row in records.values()), restriction)
 
 
 def _with_mean(body: Sequence[tuple[Cell, ...]]) -> tuple[tuple[Cell, ...], ...]:

@@ -5,28 +5,28 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Slope and bias of a logistic regression on the log-odds of the score (Platt 1999), rectified or not; fitted by
+# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999), rectified or not; fitted by
 # benchmarks/calibrate_consensus.py on the real scenes of the training set.
 _CONSENSUS = {True: (0.59, 2.60), False: (0.65, 2.25)}
 _LEAST = 1e-4  # probability, of either outcome
 _PARTS = 2**32  # of one match; whole numbers add up to the same in any order
 
 
-def calibrate_consensus(score: Tensor, *, rectified: bool = True) -> Tensor:
-    """The probability that a match is correct, from its consensus score.
+def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
+    """The probability that a match is correct within 1 px, from the belief of its neighbours.
 
     Args:
-        score: (M,) as :func:`tensor_stereo.scores.consensus.consensus_score` gives it.
+        belief: (M,) as :func:`tensor_stereo.scores.consensus.consensus_belief` gives it.
         rectified: whether the row offset was evidence.
 
     Returns:
-        (M,) float64, growing with the score. Gradients flow where the score is not saturated.
+        (M,) float64, growing with the belief. Gradients flow where the belief lies between 1e-4 and 1 - 1e-4.
 
     >>> calibrate_consensus(torch.tensor([0.0, 0.5, 1.0]))
     tensor([0.0555, 0.9309, 0.9997], dtype=torch.float64)
     """
     slope, bias = _CONSENSUS[rectified]
-    return torch.sigmoid(slope * torch.logit(score.double(), eps=_LEAST) + bias)
+    return torch.sigmoid(slope * torch.logit(belief.double(), eps=_LEAST) + bias)
 
 
 @torch.no_grad()

@@ -9,31 +9,58 @@ more than their share: of several surfaces one is enough.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from tensor_stereo import ops
-from tensor_stereo.configs import Backend, ConsensusConfig
+from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
+from tensor_stereo.scores.calibration import calibrate_consensus
 from tensor_stereo.types import Matches
 
-_MAX_ROUNDS = 1000
+
+def consensus_score(matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None) -> Tensor:
+    """The calibrated probability that each match is right, by what its neighbours in both views believe.
+
+    It is :func:`consensus_belief` through :func:`tensor_stereo.scores.calibration.calibrate_consensus`.
+
+    Args:
+        matches: B pairs, as for :func:`consensus_belief`.
+        graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
+        config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs.
+
+    Returns:
+        (M,) probability that the disparity is right within 1 px, in the dtype of the keypoints. Gradients flow to both
+        keypoints and the cost, but not where a belief lies below 1e-4 or above 1 - 1e-4.
+
+    Raises:
+        ValueError, NotImplementedError: as :func:`consensus_belief`.
+
+    Example:
+        >>> from tensor_stereo.graphs import build_match_graphs
+        >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
+        >>> right = left - torch.tensor([5.0, 0.0])
+        >>> right[0] += 20
+        >>> matches = Matches(left, right, torch.tensor([0, 50]))
+        >>> probability = consensus_score(matches, build_match_graphs(matches))
+        >>> probability[0] < 0.1, probability[1:].min() > 0.9
+        (tensor(True), tensor(True))
+    """
+    config = config or FilterConfig()
+    belief = _believe(matches, graphs, config)
+    return calibrate_consensus(belief, rectified=config.consensus.rectified).to(matches.keypoints0.dtype)
 
 
-def consensus_score(
-    matches: Matches, graphs: MatchGraphs, config: ConsensusConfig | None = None, *, backend: Backend = "auto"
-) -> Tensor:
-    """How likely every match is right, by what its neighbours in both views believe.
+def consensus_belief(matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None) -> Tensor:
+    """How much the neighbours of each match believe in it, before calibration.
 
     Args:
         matches: B pairs, coordinates in px: what is below 1 px is near. ``cost``, if given, is evidence: it is compared
             with the other costs of its pair, and left out in pairs that have infinite ones.
-        graphs: of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
-        config: None means the defaults, for rectified pairs.
-        backend: as in :func:`tensor_stereo.build_graphs`, but back ends may differ in the last digits.
+        graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
+        config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs. Back
+            ends may differ in the last digits.
 
     Returns:
         (M,) in [0, 1], higher is more likely correct; 0 without neighbours; in the dtype of the keypoints. Gradients
@@ -41,7 +68,7 @@ def consensus_score(
         There is no forward mode.
 
     Raises:
-        ValueError: for graphs over another number of matches, or settings that do not fit.
+        ValueError: for graphs over another number of matches.
         NotImplementedError: for tensors that carry a tangent.
 
     Example:
@@ -50,14 +77,18 @@ def consensus_score(
         >>> right = left - torch.tensor([5.0, 0.0])
         >>> right[0] += 20
         >>> matches = Matches(left, right, torch.tensor([0, 50]))
-        >>> score = consensus_score(matches, build_match_graphs(matches))
-        >>> score[0] < 0.01, score[1:].min() > 0.5
+        >>> belief = consensus_belief(matches, build_match_graphs(matches))
+        >>> belief[0] < 0.01, belief[1:].min() > 0.5
         (tensor(True), tensor(True))
     """
-    config = config or ConsensusConfig()
+    return _believe(matches, graphs, config or FilterConfig()).to(matches.keypoints0.dtype)
+
+
+def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig) -> Tensor:
+    """(M,) float64."""
     _check_tangents(matches)
     check_match_graphs(matches, graphs)
-    check_consensus(config)
+    settings = config.consensus
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
         matches.keypoints1,
@@ -67,18 +98,18 @@ def consensus_score(
         graphs.adjacency0.col_indices,
         graphs.adjacency1.crow_indices,
         graphs.adjacency1.col_indices,
-        config.tolerance_px,
-        config.whole_tolerance_px,
-        config.row_tolerance_px,
-        config.whole_row_tolerance_px,
-        config.slope,
-        config.reach,
-        config.doubt,
-        config.cost_weight,
-        config.num_rounds,
-        backend,
+        settings.tolerance_px,
+        settings.whole_tolerance_px,
+        settings.row_tolerance_px,
+        settings.whole_row_tolerance_px,
+        settings.slope,
+        settings.reach,
+        settings.doubt,
+        settings.cost_weight,
+        settings.num_rounds,
+        config.backend,
     )
-    return belief.to(matches.keypoints0.dtype)
+    return belief
 
 
 def _check_tangents(matches: Matches) -> None:
@@ -88,21 +119,3 @@ def _check_tangents(matches: Matches) -> None:
             continue
         if forward_ad.unpack_dual(values).tangent is not None:  # type: ignore[no-untyped-call]
             raise NotImplementedError(f"{name} carries a tangent, but the consensus score has no forward mode")
-
-
-def check_consensus(config: ConsensusConfig) -> None:
-    """Raise unless the settings are in range.
-
-    >>> check_consensus(ConsensusConfig())
-    """
-    for name, value in vars(config).items():
-        if name == "num_rounds":
-            if not (isinstance(value, int) and 1 <= value <= _MAX_ROUNDS):
-                raise ValueError(
-                    f"ConsensusConfig.num_rounds must be an integer from 1 to {_MAX_ROUNDS}, got {value!r}"
-                )
-        elif name == "row_tolerance_px" and value is None:
-            continue
-        elif not isinstance(value, int | float) or not (0 < value < math.inf or (value == 0 and name == "cost_weight")):
-            least = "at least 0" if name == "cost_weight" else "positive"
-            raise ValueError(f"ConsensusConfig.{name} must be {least} and finite, got {value!r}")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tensor_stereo.features import to_gray
+from tensor_stereo.features import list_images, to_gray
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.types import Matches
 
@@ -60,12 +60,13 @@ class ImageEvidence(NamedTuple):
 
 @torch.no_grad()
 def measure_images(
-    images0: Sequence[Tensor], images1: Sequence[Tensor], matches: Matches, graphs: MatchGraphs
+    images0: Tensor | Sequence[Tensor], images1: Tensor | Sequence[Tensor], matches: Matches, graphs: MatchGraphs
 ) -> ImageEvidence:
     """Hold the windows of every match against each other and against the rows that they lie in.
 
     Args:
-        images0: B images (C, H, W) of view 0, uint8 or floating point in [0, 1], C = 1 or 3 (RGB), of any sizes.
+        images0: B images (C, H, W) of view 0, uint8 or floating point in [0, 1], C = 1 or 3 (RGB), of any sizes; or a
+            batch (B, C, H, W).
         images1: their partners.
         matches: B pairs, keypoints in px of these images; outside of them the border is repeated.
         graphs: of the same matches; they tell which disparities to search.
@@ -84,16 +85,16 @@ def measure_images(
         >>> measure_images([image], [image], matches, build_match_graphs(matches)).curve0.shape
         torch.Size([3, 9])
     """
-    if not len(images0) == len(images1) == matches.num_pairs:
-        counts = f"{len(images0)} and {len(images1)} for {matches.num_pairs} pairs"
-        raise ValueError(f"images0 and images1 must hold one image per pair, got {counts}")
+    views = [
+        list_images(name, images, matches.num_pairs) for name, images in (("images0", images0), ("images1", images1))
+    ]
     check_match_graphs(matches, graphs)
     ranges = search_ranges(matches, graphs)
     width = max((count for _, count in ranges), default=0)
     parts = [_empty(matches.keypoints0, width)]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
         for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
-            gray = [to_gray(images[b][None])[0, 0].float() for images in (images0, images1)]
+            gray = [to_gray(images[b][None])[0, 0].float() for images in views]
             for row in range(start, stop, _ROWS_AT_ONCE):
                 rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
                 points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
@@ -145,7 +146,7 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
 
 
 def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
-    none = torch.zeros(0, device=like.device)
+    none = torch.zeros(0, dtype=torch.float32, device=like.device)
     return none.reshape(0, NUM_VALUES), none.reshape(0, width), none.reshape(0, width)
 
 

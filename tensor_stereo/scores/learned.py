@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.scores.evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.scores.quantities import (
@@ -73,7 +74,11 @@ class LearnedScore(nn.Module):
         self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
 
     def forward(
-        self, matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None
+        self,
+        matches: Matches,
+        graphs: MatchGraphs,
+        evidence: ImageEvidence | None = None,
+        config: FilterConfig | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Logit, as trained, and calibrated probability of each match being correct.
 
@@ -81,12 +86,13 @@ class LearnedScore(nn.Module):
             matches: B pairs; ``cost`` may be missing.
             graphs: of the same matches.
             evidence: of their images, or None.
+            config: ``backend`` is read; None means the defaults.
 
         Returns:
             (M,) float32 each. Gradients flow to the keypoints from all that is continuous in them, and are finite.
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
-            logit, _ = self.infer(measure_quantities(matches, graphs, evidence))
+            logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config))
             return logit, self.calibrate(logit)
 
     def infer(self, q: Quantities) -> tuple[Tensor, list[Tensor]]:
@@ -206,13 +212,22 @@ def load_learned(device: torch.device | None = None) -> LearnedScore:
         return network.requires_grad_(False).eval().to(device or torch.device("cpu"))
 
 
-def score_learned(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None) -> Tensor:
+def score_learned(
+    matches: Matches,
+    graphs: MatchGraphs,
+    evidence: ImageEvidence | None = None,
+    config: FilterConfig | None = None,
+    *,
+    network: LearnedScore | None = None,
+) -> Tensor:
     """Calibrated probability of every match being correct.
 
     Args:
         matches: B pairs of rectified views; ``cost`` may be missing.
         graphs: of the same matches.
         evidence: of their images, or None.
+        config: ``backend`` is read; None means the defaults.
+        network: The network that scores; None means the one with the weights of this package.
 
     Returns:
         (M,) float32 in (0, 1), higher is better. A match that is no vertex of the graphs (a duplicate) is scored from
@@ -232,8 +247,8 @@ def score_learned(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence
         True
     """
     check_fit(matches, graphs, evidence)
-    network = load_learned(matches.keypoints0.device)
-    parts = [network(*part)[1] for part in _parts(matches, graphs, evidence)]
+    network = load_learned(matches.keypoints0.device) if network is None else network
+    parts = [network(*part, config)[1] for part in _parts(matches, graphs, evidence)]
     return torch.cat(parts) if parts else matches.keypoints0.new_zeros(0, dtype=torch.float32)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
+from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.scores.evidence import NUM_VALUES, ImageEvidence
@@ -56,7 +57,9 @@ class Quantities(NamedTuple):
     num_pairs: int
 
 
-def measure_quantities(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None) -> Quantities:
+def measure_quantities(
+    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None, config: FilterConfig | None = None
+) -> Quantities:
     """Collect what the network sees.
 
     Nothing depends on the order of the matches, on the other pairs, on a common shift of both views, or on a shift of
@@ -66,6 +69,7 @@ def measure_quantities(matches: Matches, graphs: MatchGraphs, evidence: ImageEvi
         matches: B pairs; without ``cost`` its columns are zero.
         graphs: of the same matches.
         evidence: of the images; None: its columns are zero.
+        config: ``backend`` is read; None means the defaults.
 
     Returns:
         The quantities. Gradients flow from all that is continuous in the keypoints, and are finite; none through
@@ -87,7 +91,7 @@ def measure_quantities(matches: Matches, graphs: MatchGraphs, evidence: ImageEvi
     points = [_center(view, matches.num_pairs, batch, share) for view in (matches.keypoints0, matches.keypoints1)]
     disparity = matches.keypoints0[:, :1].double() - matches.keypoints1[:, :1].double()
     row_offset = (matches.keypoints0[:, 1].double() - matches.keypoints1[:, 1].double()).abs().float()
-    nodes, degree = _node_quantities(row_offset, graphs)
+    nodes, degree = _node_quantities(row_offset, graphs, config or FilterConfig())
     if matches.cost is None:
         cost, has_cost = nodes.new_zeros(len(nodes), NUM_COST), nodes.new_zeros(len(nodes), 1)
     else:
@@ -144,8 +148,9 @@ def _center(values: Tensor, num_pairs: int, batch: Tensor, share: Tensor) -> Ten
     return (values - mean.index_select(0, batch)).float()
 
 
-def _node_quantities(row_offset: Tensor, graphs: MatchGraphs) -> tuple[Tensor, Tensor]:
-    overlap, degree0, degree1 = (x.float() for x in shared_neighbors(graphs.adjacency0, graphs.adjacency1))
+def _node_quantities(row_offset: Tensor, graphs: MatchGraphs, config: FilterConfig) -> tuple[Tensor, Tensor]:
+    counts = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=config.backend)
+    overlap, degree0, degree1 = (count.float() for count in counts)
     degree = (degree0 + degree1 - overlap).clamp(min=1)
     columns = [
         overlap / degree,

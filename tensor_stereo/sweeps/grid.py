@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tensor_stereo.configs import DETECTORS, ObjectsConfig, SweepConfig, TrialConfig
 
 _DEFAULT = TrialConfig()
 _TOP = ("grid", "export_matches")
+_MAX_LISTED = 20  # points in a message
+_RENAMED = {"restriction": "verdict"}
 
 
 def read_grid(path: Path | str) -> SweepConfig:
@@ -62,7 +65,9 @@ def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
     """The points of a union of products.
 
     Settings that a point does not use (other detectors, the seed where nothing is random, the temperature of another
-    score than topology, the restriction where the score decides) are set to their defaults, and equal points are one.
+    score than topology, the settings of consensus for another score) are set to their defaults, and equal points are
+    one. Points whose settings contradict each other, such as a threshold under a verdict of the paper, are errors that
+    are listed together: such a grid is several tables.
 
     Args:
         tables: settings as :func:`read_grid` describes them, nested by their dots.
@@ -71,19 +76,17 @@ def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
         Distinct points, by detector first, such that those that share a stage follow one another.
 
     Raises:
-        ValueError: if a setting is unknown or has a wrong value; the message names it.
+        ValueError: if a setting is unknown or has a wrong value; the message names it. If points contradict themselves;
+            the message lists them.
 
-    >>> expand_grid([{"detector": "fast", "seed": [0, 1], "gftt": {"window_px": [7, 11]}}]) == (TrialConfig(),)
-    True
+    >>> [trial.seed for trial in expand_grid([{"detector": "fast", "seed": [0, 1], "gftt": {"window_px": [7, 11]}}])]
+    [0]
     """
     points: dict[TrialConfig, None] = {}
     for number, table in enumerate(tables):
         try:
             axes = list(_axes(table, TrialConfig, ""))
-            for values in itertools.product(*(values for _, values in axes)):
-                trial = _DEFAULT
-                for (names, _), value in zip(axes, values, strict=True):
-                    trial = _assign(trial, names, value)
+            for trial in _expand(axes):
                 points[simplify(trial)] = None
         except ValueError as error:
             where = f"grid {number + 1}: " if len(tables) > 1 else ""
@@ -91,19 +94,44 @@ def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
     return tuple(sorted(points, key=lambda trial: DETECTORS.index(trial.detector)))
 
 
+def _expand(axes: Sequence[tuple[tuple[str, ...], list[Any]]]) -> list[TrialConfig]:
+    """The points of one product; raises for those that contradict themselves, all at once."""
+    trials, wrong = [], []
+    num_points = math.prod(len(values) for _, values in axes)
+    for values in itertools.product(*(values for _, values in axes)):
+        settings: dict[str, Any] = {}
+        for (names, _), value in zip(axes, values, strict=True):
+            place = settings
+            for name in names[:-1]:
+                place = place.setdefault(name, {})
+            place[names[-1]] = value
+        try:
+            trials.append(_make(_DEFAULT, settings))
+        except ValueError as error:
+            varying = [(names, v) for (names, some), v in zip(axes, values, strict=True) if len(some) > 1]
+            point = ", ".join(f"{'.'.join(names)} = {'none' if value is None else value}" for names, value in varying)
+            wrong.append(f"{point}: {error}" if point else str(error))
+    if wrong:
+        shown = "; ".join(wrong[:_MAX_LISTED]) + ("; ..." if len(wrong) > _MAX_LISTED else "")
+        head = f"{len(wrong)} of {num_points} points contradict themselves, put them in tables [[grid]] of their own: "
+        raise ValueError((head if num_points > 1 else "") + shown)
+    return trials
+
+
 def simplify(trial: TrialConfig) -> TrialConfig:
     """The same trial with every setting that it does not use at its default.
 
-    >>> simplify(TrialConfig(seed=3)).seed
-    0
+    >>> simplify(TrialConfig(seed=3)).seed, simplify(TrialConfig()).score
+    (0, 'learned')
     """
     unused: dict[str, Any] = {name: getattr(_DEFAULT, name) for name in DETECTORS if name != trial.detector}
     if not trial.outlier_rate and not trial.noise_px:
         unused["seed"] = _DEFAULT.seed
-    if trial.score != "topology":
+    unused["score"] = trial.resolved_score
+    if trial.resolved_score != "topology":
         unused |= {"temperature": _DEFAULT.temperature, "temperature_unit": _DEFAULT.temperature_unit}
-    if trial.by_score:
-        unused["restriction"] = _DEFAULT.restriction
+    if trial.resolved_score != "consensus":
+        unused["consensus"] = _DEFAULT.consensus
     if not trial.constrained:
         unused["objects"] = ObjectsConfig()
     return replace(trial, **unused)
@@ -115,6 +143,8 @@ def _axes(table: Any, config: type, prefix: str) -> Iterator[tuple[tuple[str, ..
     if not isinstance(table, Mapping):
         raise ValueError(f"{prefix.rstrip('.') or 'grid'} must be a table of settings, got {table!r}")
     for name, value in table.items():
+        if not prefix and name in _RENAMED:
+            raise ValueError(f"{name} is {_RENAMED[name]} now")
         if name not in hints:
             raise ValueError(f"{prefix}{name} is no setting; known are {', '.join(f.name for f in fields(config))}")
         if is_dataclass(hints[name]):
@@ -129,7 +159,7 @@ def _axes(table: Any, config: type, prefix: str) -> Iterator[tuple[tuple[str, ..
 
 def _convert(name: str, value: Any, hint: Any) -> Any:
     """A value of the type that a setting has."""
-    if get_origin(hint) is UnionType:  # float | None
+    if get_origin(hint) in (Union, UnionType):  # float | None
         if value is None or value == "none":
             return None
         (hint,) = (part for part in get_args(hint) if part is not NoneType)
@@ -148,9 +178,10 @@ def _convert(name: str, value: Any, hint: Any) -> Any:
     return value
 
 
-def _assign(config: Any, names: tuple[str, ...], value: Any) -> Any:
-    """The same settings with another value at a path of names."""
-    name, *rest = names
-    if rest:
-        value = _assign(getattr(config, name), tuple(rest), value)
-    return replace(config, **{name: value})
+def _make(default: Any, settings: Mapping[str, Any]) -> Any:
+    """The default settings with others, nested by name, in their place; made at once, so that checks see them all."""
+    values = {
+        name: _make(getattr(default, name), value) if isinstance(value, dict) else value
+        for name, value in settings.items()
+    }
+    return replace(default, **values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from torch import Tensor
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.sweeps.grid import expand_grid
 from tensor_stereo.sweeps.journal import read_journals
-from tensor_stereo.sweeps.store import MATCHES_SCHEMA, METRICS_SCHEMA, errors_table
+from tensor_stereo.sweeps.store import MATCHES_SCHEMA, METRICS_SCHEMA, errors_table, read_config_file
 from tensor_stereo.types import Matches
 
 
@@ -43,6 +42,7 @@ def read_results(run: Path | str) -> pl.DataFrame:
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
+        ValueError: if it has a format that this release does not read.
     """
     return _read_parts(run, "metrics", METRICS_SCHEMA).collect().sort("unit", "trial")
 
@@ -52,8 +52,9 @@ def read_config(run: Path | str) -> SweepConfig:
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
+        ValueError: if it has a format that this release does not read.
     """
-    stored = json.loads((_check_run(run) / "config.json").read_text(encoding="utf-8"))["sweep"]
+    stored = read_config_file(_check_run(run) / "config.json")["sweep"]
     trials = tuple(trial for table in stored["trials"] for trial in expand_grid([table]))
     return SweepConfig(trials, stored["export_matches"])
 
@@ -63,6 +64,7 @@ def read_errors(run: Path | str) -> pl.DataFrame:
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
+        ValueError: if it has a format that this release does not read.
     """
     return errors_table(_check_run(run))
 
@@ -78,7 +80,7 @@ def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
-        ValueError: if it holds no such unit, or no matches.
+        ValueError: if it has a format that this release does not read, or holds no such unit, or no matches.
     """
     rows = _read_parts(run, "metrics", METRICS_SCHEMA).filter(dataset=dataset, scene=scene, trial=trial)
     units = rows.select("unit", "score").collect()
@@ -115,11 +117,13 @@ def _read_parts(run: Path | str, folder: str, schema: dict[str, object]) -> pl.L
     names = sorted(name for name in read_journals(run).files if name.startswith(f"{folder}/"))
     if not names:
         return pl.LazyFrame(schema=schema)  # type: ignore[arg-type]
-    return pl.scan_parquet([run / name for name in names])
+    # parts of an earlier release may lack columns
+    return pl.scan_parquet([run / name for name in names], schema=schema, missing_columns="insert")  # type: ignore[arg-type]
 
 
 def _check_run(run: Path | str) -> Path:
     run = Path(run)
     if not (run / "config.json").is_file():
         raise FileNotFoundError(f"{run} is no run of a sweep: it has no config.json")
+    read_config_file(run / "config.json")
     return run

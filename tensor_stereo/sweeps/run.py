@@ -28,7 +28,7 @@ from tensor_stereo.sweeps.engines import Engine, LocalEngine, Outcome
 from tensor_stereo.sweeps.log import log_to_file
 from tensor_stereo.sweeps.plan import Plan, Task, build_plan
 from tensor_stereo.sweeps.ray_engine import RayEngine
-from tensor_stereo.sweeps.store import RunStore, append_environment
+from tensor_stereo.sweeps.store import FORMAT, RunStore, append_environment
 from tensor_stereo.sweeps.units import failed_unit
 from tensor_stereo.trials import TrialRunner
 from tensor_stereo.types import StereoPair
@@ -99,7 +99,8 @@ def run_sweep(
 ) -> SweepSummary:
     """Run every pair of a manifest through every point of a grid, and store what comes out.
 
-    A run that ended early, for whatever reason, goes on where it was: call it again with the same arguments. SIGINT and
+    A run that ended early, for whatever reason, goes on where it was: call it again with the same arguments. A release
+    that only adds settings continues the run of an earlier one, with the defaults of those settings. SIGINT and
     SIGTERM finish the units under way first; a second one ends at once. Results do not depend on engine, number of
     workers, shards or interruptions, in all columns but ``seconds``, ``host`` and ``attempt``.
 
@@ -141,7 +142,7 @@ def run_sweep(
         check_trials(config)
     table = pl.read_parquet(manifest)
     record = {
-        "format": 1,
+        "format": FORMAT,
         "sweep": asdict(config),
         "manifest": {"num_pairs": len(plan.pairs), "sha256": _fingerprint(plan)},
     }
@@ -191,7 +192,7 @@ def drive(
 
 
 def check_trials(config: SweepConfig) -> None:
-    """Run every point once on a small noise image, so that a bad setting is told before the sweep begins.
+    """Run every point once on a small noise image, and report a bad setting before the sweep begins.
 
     Raises:
         ValueError: naming the point.

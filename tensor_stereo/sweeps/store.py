@@ -20,6 +20,7 @@ import io
 import json
 import logging
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ import numpy as np
 import polars as pl
 
 from tensor_stereo.atomic import whole_file
+from tensor_stereo.configs import TrialConfig
 from tensor_stereo.evaluation import ROW_SCHEMA
 from tensor_stereo.sweeps.journal import append, enter, is_open_elsewhere, open_journal, read_journals, run_lock
 from tensor_stereo.sweeps.units import UnitResult
@@ -34,6 +36,7 @@ from tensor_stereo.sweeps.units import UnitResult
 LOG = logging.getLogger(__name__)
 _MAX_ROWS = 20_000  # that wait for their part, about 80 MB; a hundred matches weigh as much as a row
 _FOLDERS = ("metrics", "matches")
+FORMAT = 2  # of the run folder; another number when settings or columns are renamed, removed or change their meaning
 METRICS_SCHEMA: dict[str, Any] = {
     "unit": pl.Int32,  # number of the unit in the plan
     **ROW_SCHEMA,
@@ -213,7 +216,7 @@ def _claim(out: Path, config: dict[str, Any], manifest: pl.DataFrame) -> None:
     path = out / "config.json"
     config = json.loads(json.dumps(config))
     if path.exists():
-        known = json.loads(path.read_text())
+        known = read_config_file(path)
         if known != config:
             change = _first_difference(known, config, "")
             raise ValueError(f"out: {out} holds results of other settings: {change}; name another folder")
@@ -224,6 +227,32 @@ def _claim(out: Path, config: dict[str, Any], manifest: pl.DataFrame) -> None:
         raise ValueError(f"out: {out} is no run, but holds {min(others)}; name another folder")
     _write_table(manifest, out / "manifest.parquet")
     write_json(config, path)
+
+
+def read_config_file(path: Path) -> dict[str, Any]:
+    """The configuration of a run, with the defaults of settings that came after it.
+
+    Raises:
+        ValueError: if the run has another format, or settings that this release does not know.
+    """
+    config: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    found = config.get("format")
+    if found != FORMAT:
+        raise ValueError(f"{path.parent} is a run of format {found}, this release reads format {FORMAT}")
+    if "sweep" in config:
+        default = json.loads(json.dumps(asdict(TrialConfig())))
+        trials = [_complete(trial, default, f"{path.parent}: setting ") for trial in config["sweep"]["trials"]]
+        config["sweep"]["trials"] = trials
+    return config
+
+
+def _complete(settings: dict[str, Any], default: dict[str, Any], name: str) -> dict[str, Any]:
+    for key, value in settings.items():
+        if key not in default:
+            raise ValueError(f"{name}{key} is unknown to this release; a later one has written the run")
+        if isinstance(value, dict) and isinstance(default[key], dict):
+            settings = settings | {key: _complete(value, default[key], f"{name}{key}.")}
+    return default | settings
 
 
 def _first_difference(known: Any, given: Any, name: str) -> str:

@@ -94,7 +94,7 @@ def _run_unit(config: SweepConfig, task: Task, runner: TrialRunner) -> UnitResul
 
 def _match_columns(number: int, trial: Trial) -> dict[str, NDArray[Any]]:
     matches, verdict = trial.matches, trial.classification
-    nothing = torch.full((matches.num_matches,), torch.nan)
+    nothing = torch.full((matches.num_matches,), torch.nan, dtype=torch.float32)
     return {
         "trial": np.full(matches.num_matches, number, np.int32),
         "x0": matches.keypoints0[:, 0].numpy(),

@@ -99,7 +99,7 @@ def _figure(
     verdicts += [(k, row, INK) for k, of_run in enumerate(of_runs) if of_run for row in of_run.verdicts]
     seen: set[tuple[Any, ...]] = set()
     for k, row, color in verdicts:
-        shape = "diamond" if decided_by_score(row) else _VERDICTS.get(row["restriction"], "circle")
+        shape = "diamond" if decided_by_score(row) else _VERDICTS.get(row["verdict"], "circle")
         place = k, row["sensitivity"], row["specificity"], shape
         if place in seen:  # settings without an effect on the verdict
             continue

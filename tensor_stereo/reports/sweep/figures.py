@@ -157,7 +157,7 @@ def _labels(shown: Sequence[_Series], name: str) -> list[str]:
     firsts = [item.rows[0] for item in shown]
     runs = [item.run for item in shown]
     names = [each for each in telling_names(firsts, runs) if each != name]
-    return distinct_labels(firsts, names or ["restriction"], runs)
+    return distinct_labels(firsts, names or ["verdict"], runs)
 
 
 def _panel(

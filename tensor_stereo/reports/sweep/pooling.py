@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import polars as pl
 import torch
 
-from tensor_stereo.configs import CUTS, DETECTORS
+from tensor_stereo.configs import DETECTORS, ConsensusConfig
 from tensor_stereo.metrics import Confusion, ScoreCounts
 from tensor_stereo.reports.sweep.results import COUNTS
 from tensor_stereo.trials import SCORE_BINS, SENSITIVITY
@@ -34,7 +34,7 @@ SETTINGS = {
     "min_disparity_px": Setting("min. disparity px", "off"),
     "max_disparity_px": Setting("max. disparity px", "off"),
     "variant": Setting("variant"),
-    "restriction": Setting("restriction"),
+    "verdict": Setting("verdict"),
     "min_group_size": Setting("min. group"),
     "tie_tolerance": Setting("tie tolerance"),
     "outlier_rate": Setting("outliers"),
@@ -43,6 +43,7 @@ SETTINGS = {
     "score": Setting("score"),
     "temperature": Setting("temperature"),
     "temperature_unit": Setting("unit"),
+    **{f"consensus_{f.name}": Setting(f"consensus {f.name.replace('_', ' ')}") for f in fields(ConsensusConfig)},
     "threshold": Setting("threshold"),
     "target_sensitivity": Setting("target sens."),
     "min_precision": Setting("min. precision"),
@@ -55,13 +56,14 @@ PERTURBATIONS = ("outlier_rate", "noise_px")
 _BALANCED = (pl.col("sensitivity") + pl.col("specificity")) / 2
 
 
-_PARENTS = ("detector", "score")  # on which other settings can depend
+_PARENTS = ("detector", "verdict", "score")  # on which other settings can depend
 
 
 def telling_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of the settings that tell some rows apart; the rows may lack some settings.
 
-    One that follows from the detector or the score, as a window that only FAST has, adds nothing and is left out.
+    One that follows from the detector, the verdict or the score, as a window that only FAST has, adds nothing and is
+    left out.
 
     >>> row = dict.fromkeys(SETTINGS, 0)
     >>> telling_settings([row, row | {"score": 1, "temperature": 5.0}, row | {"noise_px": 2}])
@@ -98,15 +100,15 @@ def settings_label(row: Mapping[str, Any], names: Sequence[str]) -> str:
 
     Words speak for themselves, numbers come with their heading; settings that do not apply are left out.
 
-    >>> row = dict(score="topology", temperature=0.5, temperature_unit=None, threshold=None)
+    >>> row = dict(verdict="cardinality", score="topology", temperature=0.5, temperature_unit=None, threshold=None)
     >>> settings_label(row, list(row))
-    'topology, temperature 0.5, set test'
+    'cardinality, topology, temperature 0.5'
     """
     parts = []
     for name in names:
         text = setting_text(name, row[name])
-        if name == "threshold" and not decided_by_score(row):
-            parts.append("set test")
+        if name == "verdict" and text == "score":
+            parts.append("by score")
         elif name == "score" and text == "none":
             parts.append("no score")
         elif text != Setting.none:
@@ -115,12 +117,12 @@ def settings_label(row: Mapping[str, Any], names: Sequence[str]) -> str:
 
 
 def decided_by_score(row: Mapping[str, Any]) -> bool:
-    """Whether the verdict of a row is one of the score; the row may lack settings.
+    """Whether the verdict of a row is one of the score.
 
-    >>> decided_by_score({"restriction": "adjacency", "threshold": None}), decided_by_score({"min_precision": 0.9})
+    >>> decided_by_score({"verdict": "adjacency"}), decided_by_score({"verdict": "score"})
     (False, True)
     """
-    return any(row.get(name) is not None for name in CUTS)
+    return bool(row["verdict"] == "score")
 
 
 def mildest(results: pl.DataFrame) -> pl.DataFrame:

@@ -1,0 +1,119 @@
+"""Types and limits of settings: each dataclass declares them, one function checks them. Imports no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, is_dataclass
+from functools import cache
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+
+@dataclass(frozen=True)
+class Within:
+    """An interval that a number must lie in; NaN lies in none.
+
+    >>> print(Within(0, 1), Within(0, open_low=True, open_high=True))
+    [0, 1] (0, inf)
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    open_low: bool = False  # whether ``low`` itself is outside
+    open_high: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        above = self.low < value if self.open_low else self.low <= value
+        return above and (value < self.high if self.open_high else value <= self.high)
+
+    def __str__(self) -> str:
+        begin, end = "(" if self.open_low else "[", ")" if self.open_high else "]"
+        return f"{begin}{self.low:g}, {self.high:g}{end}"
+
+
+@dataclass(frozen=True)
+class Odd:
+    """A number of pixels that has a middle one."""
+
+    def __contains__(self, value: int) -> bool:
+        return value >= 1 and value % 2 == 1
+
+    def __str__(self) -> str:
+        return "the odd numbers from 1"
+
+
+Fraction = Annotated[float, Within(0, 1)]
+Positive = Annotated[float, Within(0, open_low=True, open_high=True)]
+Count = Annotated[int, Within(1, 2**31 - 1)]
+OddPx = Annotated[int, Odd()]
+
+
+def check_settings(settings: Any, *, prefix: str = "") -> None:
+    """Raise unless every field of a dataclass has a value of its type, within its limits.
+
+    Args:
+        settings: an instance whose fields are booleans, numbers, strings of a ``Literal``, tuples of them, nested
+            dataclasses, or ``None`` where the annotation allows it; ``Annotated`` adds limits.
+        prefix: comes before the name of the field in the message, such as ``"FASTConfig."``.
+
+    Raises:
+        TypeError: if a value has another type.
+        ValueError: if it has the type but lies outside of the limits.
+
+    >>> from tensor_stereo.configs import FASTConfig
+    >>> FASTConfig(window_px=10)
+    Traceback (most recent call last):
+    ...
+    ValueError: FASTConfig.window_px must lie in the odd numbers from 1, got 10
+    """
+    kind: Any = type(settings)
+    for name, hint in _hints(kind).items():
+        _check(f"{prefix}{name}", getattr(settings, name), hint)
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _check(name: str, value: Any, hint: Any) -> None:
+    limits: tuple[Any, ...] = ()
+    while get_origin(hint) is Annotated:
+        hint, *more = get_args(hint)
+        limits += tuple(more)
+    if get_origin(hint) in (Union, UnionType):  # such as float | None
+        if value is None:
+            return
+        (hint,) = (part for part in get_args(hint) if part is not NoneType)
+        _check(name, value, Annotated[hint, *limits] if limits else hint)
+        return
+    if get_origin(hint) is Literal:
+        if value not in get_args(hint):
+            raise ValueError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}, got {value!r}")
+        return
+    if get_origin(hint) is tuple:
+        _check_type(name, value, tuple)
+        for k, item in enumerate(value):
+            _check(f"{name}[{k}]", item, get_args(hint)[0])
+        return
+    _check_type(name, value, hint)
+    if is_dataclass(hint):
+        return  # has checked itself
+    if hint is float and math.isnan(value):
+        raise ValueError(f"{name} must be a number, got {value}")
+    for limit in limits:
+        if value not in limit:
+            raise ValueError(f"{name} must lie in {limit}, got {value}")
+
+
+def _check_type(name: str, value: Any, kind: type) -> None:
+    if kind in (int, float):  # NumPy's numbers are such too
+        fits = isinstance(value, Real if kind is float else Integral) and not isinstance(value, bool)
+    else:
+        fits = isinstance(value, kind)
+    if not fits:
+        raise TypeError(f"{name} must be {_WORDS.get(kind, kind.__name__)}, got {value!r}")
+
+
+_WORDS = {int: "an integer", float: "a number", bool: "True or False"}

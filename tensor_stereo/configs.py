@@ -169,17 +169,17 @@ class FilterConfig:
         TypeError: if a value has another type.
     """
 
-    verdict: Verdict = "score"
-    score: ScoreName = "auto"
+    verdict: Verdict = "score"  # what decides: the score, or Restriction 1 or 2 of the paper
+    score: ScoreName = "auto"  # auto: learned where the score decides, none elsewhere
     threshold: Fraction | None = None  # least score of a match that is kept
     target_sensitivity: Fraction | None = None  # fraction of the incorrect matches that are rejected, at least
     min_precision: Fraction | None = None  # fraction of the kept matches that are correct, at least
     min_group_size: Annotated[int, Within(1, 2**31 - 1)] = 4  # distinct matches below which a group says nothing
     tie_tolerance: Annotated[float, Within(0, 1, open_high=True)] = 1e-3  # in edge lengths
     temperature: Annotated[float, Within(COLDEST, HOTTEST)] = 1.0  # of the score topology
-    temperature_unit: TemperatureUnit = "edge"
+    temperature_unit: TemperatureUnit = "edge"  # edge: lengths of the edge at hand
     consensus: ConsensusConfig = field(default_factory=ConsensusConfig)  # of the score consensus
-    backend: Backend = "auto"
+    backend: Backend = "auto"  # native: compiled kernels; scipy: graphs by scipy, all else by torch
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -223,6 +223,7 @@ class FileFilterConfig(FilterConfig):
     """
 
     verdict: Verdict | None = None  # type: ignore[assignment]
+    """what decides; None: the score, but cardinality in files of hloc, COLMAP and LightGlue"""
 
     def __post_init__(self) -> None:
         if self.verdict is None:
@@ -233,10 +234,11 @@ class FileFilterConfig(FilterConfig):
     def resolve(self, *, rectified: bool) -> FilterConfig:
         """The settings for a file.
 
-        Pairs that are not rectified get a consensus score without row offsets, where ``auto`` is left to choose.
+        Files of pairs that are not rectified get a ``consensus`` score without row offsets, unless a score or a verdict
+        of the paper is named.
 
         Args:
-            rectified: whether the form of the file promises rectified pairs.
+            rectified: Whether the form of the file promises rectified pairs.
 
         Raises:
             ValueError: if settings contradict the verdict of the file.
@@ -247,7 +249,7 @@ class FileFilterConfig(FilterConfig):
         settings = {f.name: getattr(self, f.name) for f in fields(FilterConfig)}
         if self.verdict is None:
             settings["verdict"] = "score" if rectified else "cardinality"
-        if not rectified and self.score == "auto":
+        if not rectified and self.score == "auto" and self.verdict not in RESTRICTIONS:
             settings["score"] = "consensus"
         if not rectified and self.consensus == ConsensusConfig():
             settings["consensus"] = UNRECTIFIED

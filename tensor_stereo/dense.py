@@ -13,7 +13,7 @@ from tensor_stereo.duplicates import coincident_ids, first_of_coincident
 from tensor_stereo.filters import FilterOutput
 from tensor_stereo.modules import DelaunayFilter, Images
 from tensor_stereo.ops.segments import pair_of, to_points
-from tensor_stereo.types import Matches
+from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
 
 
 class FilteredDisparity(NamedTuple):
@@ -80,12 +80,12 @@ def filter_disparity(
                 [False,  True,  True,  True],
                 [False,  True,  True,  True]])
     """
-    if not torch.is_tensor(disparity):
-        raise TypeError(f"disparity must be a tensor, got {type(disparity).__name__}")
-    if disparity.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"disparity must be float32 or float64, got {disparity.dtype}")
+    check_tensor("disparity", disparity)
+    check_pixels("disparity", disparity)
+    if mask is not None:
+        check_mask("mask", mask)
     if disparity.ndim == 2:
-        mask = mask[None, None] if torch.is_tensor(mask) else mask
+        mask = None if mask is None else mask[None, None]
         result = filter_disparity(
             disparity[None, None], stride, filter=filter, mask=mask, images0=images0, images1=images1
         )
@@ -97,10 +97,6 @@ def filter_disparity(
         raise TypeError(f"stride must be an integer number of px, got {stride!r}")
     if stride < 1:
         raise ValueError(f"stride must be at least 1 px, got {stride}")
-    if mask is not None and not torch.is_tensor(mask):
-        raise TypeError(f"mask must be a tensor, got {type(mask).__name__}")
-    if mask is not None and mask.dtype != torch.bool:
-        raise TypeError(f"mask must be bool, got {mask.dtype}")
     if mask is not None and mask.shape != disparity.shape:
         raise ValueError(f"mask must have the shape {tuple(disparity.shape)} of disparity, got {tuple(mask.shape)}")
     height, width = disparity.shape[2:]

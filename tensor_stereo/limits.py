@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 class Within:
     """An interval that a number must lie in; NaN lies in none.
 
-    >>> print(Within(0, 1), Within(0, open_low=True, open_high=True))
-    [0, 1] (0, inf)
+    >>> print(Within(0, 1))
+    lie in [0, 1]
     """
 
     low: float = -math.inf
@@ -29,7 +29,7 @@ class Within:
 
     def __str__(self) -> str:
         begin, end = "(" if self.open_low else "[", ")" if self.open_high else "]"
-        return f"{begin}{self.low:g}, {self.high:g}{end}"
+        return f"lie in {begin}{self.low:g}, {self.high:g}{end}"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Odd:
         return value >= 1 and value % 2 == 1
 
     def __str__(self) -> str:
-        return "the odd numbers from 1"
+        return "be odd and at least 1"
 
 
 Fraction = Annotated[float, Within(0, 1)]
@@ -65,7 +65,7 @@ def check_settings(settings: Any, *, prefix: str = "") -> None:
     >>> FASTConfig(window_px=10)
     Traceback (most recent call last):
     ...
-    ValueError: FASTConfig.window_px must lie in the odd numbers from 1, got 10
+    ValueError: FASTConfig.window_px must be odd and at least 1, got 10
     """
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():
@@ -100,11 +100,11 @@ def _check(name: str, value: Any, hint: Any) -> None:
     _check_type(name, value, hint)
     if is_dataclass(hint):
         return  # has checked itself
-    if hint is float and math.isnan(value):
-        raise ValueError(f"{name} must be a number, got {value}")
+    if hint is float and not limits:
+        limits = (Within(),)  # a number, not NaN
     for limit in limits:
         if value not in limit:
-            raise ValueError(f"{name} must lie in {limit}, got {value}")
+            raise ValueError(f"{name} must {limit}, got {value}")
 
 
 def _check_type(name: str, value: Any, kind: type) -> None:

@@ -63,9 +63,8 @@ class DelaunayFilter(nn.Module):
         ValueError: for a value outside of its limits, or settings that contradict each other.
 
     The state dictionary holds the weights and a fingerprint of the settings that define the score; the state of another
-    score is refused. ``torch.compile(fullgraph=True)`` works for ``topology`` and ``consensus``. It does not for
-    ``learned``, whose links between matches are as many as the data say: compile the rest of the model around it, with
-    a graph break here.
+    score is refused. ``torch.compile(fullgraph=True)`` works, for ``learned`` with batches that have at least one pair
+    of neighbours, and without images: to use these, measure the evidence outside of the compiled part.
 
     Source: the set tests are those of Bustos, Vargas & Trujillo, CIARP 2016, section 3; the scores are this library's.
 

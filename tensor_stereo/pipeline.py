@@ -78,7 +78,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         >>> pair = render_pair(0)
         >>> output = run_pipeline([(pair.image0, pair.image1)])
         >>> kept = output.classification.inlier
-        >>> bool(output.score[kept].min() >= 0.5), bool(kept.sum() > 300)
+        >>> bool(output.score[kept].min() >= 0.5), bool(kept.sum() > 100)
         (True, True)
     """
     watch = Stopwatch()

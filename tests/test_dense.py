@@ -27,7 +27,7 @@ def smooth_filter(matches: Matches) -> FilterOutput:
 @given(st.integers(-40, 40), st.integers(1, 7), st.sampled_from(["adjacency", "cardinality"]))
 def test_constant_disparity_keeps_every_match(value: int, stride: int, restriction: str) -> None:
     disparity = plane(0, 0, value)
-    result = filter_disparity(disparity, stride, filter=DelaunayFilter(restriction=restriction))
+    result = filter_disparity(disparity, stride, filter=DelaunayFilter(verdict=restriction))
     x, y = result.grid.unbind(-1)
     assert torch.equal(result.mask[0, 0], (x - value >= 0) & (x - value <= 89))
     assert bool(result.mask.any())
@@ -50,10 +50,15 @@ def test_patch_of_wrong_disparities_is_rejected_and_the_rest_kept(sign: int) -> 
     disparity = plane(0.05, 0.0, 8 * sign)
     generator = torch.Generator().manual_seed(0)
     disparity[0, 0, 20:40, 40:60] += 3 + 12 * torch.rand(20, 20, dtype=torch.float64, generator=generator)
-    result = filter_disparity(disparity, 4)
+    result = filter_disparity(disparity, 4, filter=DelaunayFilter(verdict="cardinality"))
     x, y = result.grid.unbind(-1)
     wrong = (x >= 40) & (x < 60) & (y >= 20) & (y < 40)
     assert not bool(result.inlier[0, 0][wrong].any())
+    # The probability keeps hardly any of them, and holds within .05 of what it keeps.
+    by_score = filter_disparity(disparity, 4)
+    assert float(by_score.inlier[0, 0][wrong].double().mean()) < 0.2
+    precision = float((~wrong)[by_score.inlier[0, 0]].double().mean())
+    assert precision == pytest.approx(float(by_score.score[by_score.inlier].mean()), abs=0.05)
     # Beyond the columns that the patch covers in either view, nothing has changed.
     far = result.mask[0, 0] & ((y < 14) | (y > 46))
     assert bool(result.inlier[0, 0][far].all())
@@ -84,12 +89,16 @@ def test_batch_equals_loop(seed: int, stride: int, masked: bool) -> None:
     disparity[1, 0, :10] = torch.nan
     disparity[2] = torch.nan
     mask = torch.rand(3, 1, 24, 32, generator=generator) < 0.8 if masked else None
-    batched = filter_disparity(disparity, stride, mask=mask)
-    assert not bool(batched.mask[2].any())
-    for b in range(3):
-        alone = filter_disparity(disparity[b : b + 1], stride, mask=None if mask is None else mask[b : b + 1])
-        for name in ("inlier", "score", "mask"):
-            assert torch.equal(getattr(alone, name)[0], getattr(batched, name)[b]), name
+    for run in (DelaunayFilter(score="consensus"), None):
+        batched = filter_disparity(disparity, stride, mask=mask, filter=run)
+        assert not bool(batched.mask[2].any())
+        for b in range(3):
+            alone = filter_disparity(disparity[b, 0], stride, mask=None if mask is None else mask[b, 0], filter=run)
+            assert torch.equal(alone.mask, batched.mask[b, 0])
+            if run is not None:
+                assert torch.equal(alone.inlier, batched.inlier[b, 0])
+                assert torch.equal(alone.score, batched.score[b, 0])
+            torch.testing.assert_close(alone.score, batched.score[b, 0], rtol=0, atol=1e-4)  # learned, in float32
 
 
 def test_verdicts_are_those_of_the_filter_on_the_listed_matches() -> None:
@@ -198,11 +207,11 @@ def test_bad_arguments_are_named() -> None:
         filter_disparity(disparity.half(), 4)
     with pytest.raises(ValueError, match="stride must be at least 1"):
         filter_disparity(disparity, 0)
-    with pytest.raises(TypeError, match="disparity must be a tensor, got ndarray"):
+    with pytest.raises(TypeError, match=r"disparity must be a torch\.Tensor, got ndarray"):
         filter_disparity(disparity.numpy(), 4)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"stride must be an integer number of px, got 4\.0"):
         filter_disparity(disparity, 4.0)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="mask must be a tensor, got ndarray"):
+    with pytest.raises(TypeError, match=r"mask must be a torch\.Tensor, got ndarray"):
         filter_disparity(disparity, 4, mask=(disparity > 0).numpy())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="mask must be bool"):
         filter_disparity(disparity, 4, mask=disparity)

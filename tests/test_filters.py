@@ -177,7 +177,7 @@ def test_module_equals_function_for_any_padding() -> None:
             to_padded(v, batch.ptr, num_rows=num_rows, fill=fill)
             for v in (batch.keypoints0, batch.keypoints1, batch.cost)  # type: ignore[arg-type]
         )
-        output = DelaunayFilter(restriction="adjacency")(k0, k1, mask, cost=cost)
+        output = DelaunayFilter(verdict="adjacency")(k0, k1, mask, cost=cost)
         expected = classify_matches(batch, restriction="adjacency")
         assert torch.equal(output.inlier[mask], expected.inlier)
         assert torch.equal(output.relation[mask], expected.relation)
@@ -188,7 +188,7 @@ def test_module_names_a_bad_argument() -> None:
     good = torch.rand(2, 5, 2)
     module = DelaunayFilter()
     for name, arguments in {
-        "keypoints0": (good[0], good[0]),
+        "keypoints0": (good[..., :1], good[..., :1]),
         "keypoints1": (good, good[:, :4]),
         "mask": (good, good, torch.ones(2, 4, dtype=torch.bool)),
         "group": (good, good, None, torch.zeros(2, 4, dtype=torch.int64)),

@@ -7,7 +7,6 @@ import io
 import pickle
 import shutil
 
-import numpy as np
 import pytest
 import torch
 
@@ -36,10 +35,11 @@ def _wrong_at_random(matches: ts.Matches) -> ts.Matches:
 BATCH = [random_pair("integer", seed, n) for seed, n in enumerate((50, 1, 0, 2, 3, 30))]
 
 
-def test_batch_equals_loop_bit_for_bit() -> None:
+@pytest.mark.parametrize("score", ["topology", "consensus"])
+def test_batch_equals_loop_bit_for_bit(score: str) -> None:
     batch = _wrong_at_random(collate_matches(BATCH))
     leaf = batch.keypoints1.clone().requires_grad_()
-    module = ts.DelaunayFilter()
+    module = ts.DelaunayFilter(score=score, threshold=0.5)
     output = module(ts.Matches(batch.keypoints0, leaf, batch.ptr, batch.cost))
     output.score.sum().backward()
     assert leaf.grad is not None
@@ -54,6 +54,13 @@ def test_batch_equals_loop_bit_for_bit() -> None:
         assert torch.equal(leaf.grad[rows], alone.grad if alone.grad is not None else torch.zeros_like(alone))
         start = rows.stop
     assert 0 < float(output.score.detach().mean()) < 1
+
+
+def test_batch_equals_loop_up_to_single_precision_for_learned() -> None:
+    batch = _wrong_at_random(collate_matches(BATCH))
+    module = ts.DelaunayFilter()
+    alone = torch.cat([module(one).score for one in split_matches(batch)])
+    torch.testing.assert_close(module(batch).score, alone, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("fill", [0.0, NAN, 1e300])
@@ -120,37 +127,53 @@ def test_straight_through_has_the_hard_verdict_and_the_soft_gradient() -> None:
     assert torch.equal(*gradients)
 
 
-def test_threshold_replaces_the_restriction() -> None:
+@pytest.mark.parametrize("score", ["auto", "consensus", "learned"])
+def test_a_match_is_kept_from_probability_one_half_or_the_threshold_on(score: str) -> None:
     left, right = _padded()
-    output = ts.DelaunayFilter(threshold=0.6)(left, right)
-    tested = output.relation != ts.Relation.UNTESTED
-    assert torch.equal(output.inlier, tested & (output.score >= 0.6))
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        low = ts.DelaunayFilter(threshold=0.6)(left, right)
-    assert torch.equal(low.inlier, (low.relation != ts.Relation.UNTESTED) & (low.score >= 0.6))
-    assert not torch.equal(output.inlier, ts.DelaunayFilter()(left, right).inlier)
+    for threshold, least in ((None, 0.5), (0.9, 0.9), (0.0, 0.0)):
+        module = ts.DelaunayFilter(score=score, threshold=threshold)
+        output = module(left, right)
+        tested = output.relation != ts.Relation.UNTESTED
+        assert torch.equal(output.inlier, tested & (output.score >= least))
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            low = module(left, right)
+        assert torch.equal(low.inlier, (low.relation != ts.Relation.UNTESTED) & (low.score >= least))
+
+
+@pytest.mark.parametrize("restriction", ["adjacency", "cardinality"])
+def test_the_verdicts_of_the_paper_are_those_of_classify_matches(restriction: str) -> None:
+    matches = _wrong_at_random(collate_matches(BATCH))
+    expected = ts.classify_matches(matches, restriction=restriction)  # type: ignore[arg-type]
+    for score in ("auto", "none", "consensus", "learned"):
+        output = ts.DelaunayFilter(verdict=restriction, score=score)(matches)
+        assert torch.equal(output.inlier, expected.inlier)
+        assert torch.equal(output.relation, expected.relation)
+        assert (output.score is None) == (score == "none")
+    assert torch.equal(ts.DelaunayFilter()(matches).relation, expected.relation)
+    soft = ts.DelaunayFilter(verdict=restriction, score="topology")(matches).score
+    assert torch.equal(ts.DelaunayFilter(verdict=restriction)(matches).score, soft)
 
 
 def test_temperature_can_be_learnt() -> None:
     left, right = _padded()
-    module = ts.DelaunayFilter(score="topology", temperature=0.5, learnable_temperature=True)
+    module = ts.DelaunayFilter(verdict="cardinality", temperature=0.5, learnable_temperature=True)
     optimizer = torch.optim.SGD(module.parameters(), lr=0.01)
     before = module(left, right).score.mean()
     before.neg().backward()
     optimizer.step()
     assert module.temperature.item() != 0.5
     assert module(left, right).score.mean() > before
-    assert not list(ts.DelaunayFilter().parameters())
+    assert not list(ts.DelaunayFilter(score="consensus").parameters())
 
 
 def test_state_survives_saving_copying_and_pickling() -> None:
     left, right = _padded()
-    module = ts.DelaunayFilter(score="topology", temperature=0.7, learnable_temperature=True, restriction="adjacency")
+    module = ts.DelaunayFilter(verdict="adjacency", temperature=0.7, learnable_temperature=True)
     expected = module(left, right)
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     file.seek(0)
-    restored = ts.DelaunayFilter(score="topology", learnable_temperature=True, restriction="adjacency")
+    restored = ts.DelaunayFilter(verdict="adjacency", learnable_temperature=True)
     restored.load_state_dict(torch.load(file, weights_only=True))
     for other in (restored, copy.deepcopy(module), pickle.loads(pickle.dumps(module))):
         assert torch.equal(other(left, right).score, expected.score)
@@ -190,15 +213,20 @@ def test_inliers_feed_the_next_filter() -> None:
 def test_unrectified_pairs_and_negative_disparities_are_like_any_other() -> None:
     left, right = (points.double() for points in _padded())
     turn = torch.tensor([[0.8, 0.6], [-0.6, 0.8]], dtype=torch.float64)
-    expected = ts.DelaunayFilter(score="topology")(left, right)
+    expected = ts.DelaunayFilter(verdict="cardinality")(left, right)
     for moved in (right + torch.tensor([50.0, 0.0]), right @ turn * 1.5, right.flip(-1)):
-        output = ts.DelaunayFilter(score="topology")(left, moved)
+        output = ts.DelaunayFilter(verdict="cardinality")(left, moved)
         assert torch.equal(output.inlier, expected.inlier)
         assert torch.allclose(output.score, expected.score, atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"min_precision": 0.9}, {"score": "topology", "learnable_temperature": True, "threshold": 0.4}]
+    "settings",
+    [
+        {},
+        {"score": "consensus", "min_precision": 0.9},
+        {"score": "topology", "learnable_temperature": True, "threshold": 0.4},
+    ],
 )
 def test_the_module_compiles_without_a_graph_break(settings: dict[str, object]) -> None:
     _compare_compiled("aot_eager", settings)
@@ -208,7 +236,7 @@ def test_the_module_compiles_without_a_graph_break(settings: dict[str, object]) 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler uses parts of torch that torch deprecates
 def test_the_module_compiles_with_inductor() -> None:
-    _compare_compiled("inductor", {"score": "topology", "learnable_temperature": True})
+    _compare_compiled("inductor", {"score": "topology", "learnable_temperature": True, "threshold": 0.4})
 
 
 def _compare_compiled(backend: str, settings: dict[str, object]) -> None:
@@ -248,40 +276,10 @@ def test_cuda_tensors_come_back_on_their_device() -> None:
     assert leaf.grad.isfinite().all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"restriction": "cardinal"}, "restriction"),
-        ({"score": "best"}, "score"),
-        ({"temperature_unit": "cm"}, "temperature_unit"),
-        ({"temperature": 0.0}, "temperature"),
-        ({"temperature": np.nan}, "temperature"),
-        ({"threshold": 7.0}, "threshold"),
-        ({"threshold": np.nan}, "threshold"),
-        ({"tie_tolerance": 5.0}, "tie_tolerance"),
-        ({"backend": "foo"}, "backend"),
-        ({"min_group_size": 0}, "min_group_size"),
-    ],
-)
-def test_unknown_options_are_refused(arguments: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ts.DelaunayFilter(**arguments)  # type: ignore[arg-type]
-
-
-def test_arguments_that_do_not_fit_together_are_refused() -> None:
-    module, (left, right) = ts.DelaunayFilter(), _padded()
-    with pytest.raises(ValueError, match="keypoints1"):
-        module(left)
-    with pytest.raises(TypeError, match="keypoints0 must be a tensor"):
-        module(left.numpy(), right.numpy())
-    with pytest.raises(TypeError, match="cost"):
-        module(module(left, right).matches, cost=torch.zeros(1))
-
-
 def test_a_move_to_another_dtype_keeps_the_temperature() -> None:
     for module in (
-        ts.DelaunayFilter(score="topology", temperature=3.0),
-        ts.DelaunayFilter(score="topology", temperature=3.0, learnable_temperature=True),
+        ts.DelaunayFilter(verdict="cardinality", temperature=3.0),
+        ts.DelaunayFilter(verdict="cardinality", temperature=3.0, learnable_temperature=True),
     ):
         assert module.half().temperature.item() == pytest.approx(3.0, rel=1e-15)
         assert module.temperature.dtype == torch.float64

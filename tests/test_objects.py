@@ -204,7 +204,7 @@ def test_objects_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="image must have shape"):
         trace_objects(image)
     for element_px in (0, 4):
-        with pytest.raises(ValueError, match="element_px must be odd"):
+        with pytest.raises(ValueError, match=r"ObjectsConfig\.element_px must be odd"):
             label_objects(image, ObjectsConfig(element_px=element_px))
     with pytest.raises(ValueError, match="min_area_px"):
         label_objects(image, ObjectsConfig(min_area_px=-1))

@@ -6,13 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from tensor_stereo.configs import DETECTORS, Detector, PipelineConfig
+from tensor_stereo import DelaunayFilter
+from tensor_stereo.configs import DETECTORS, Detector, FilterConfig, MatchingConfig, PipelineConfig, Score
 from tensor_stereo.datasets import PairDataset, find_pairs
 from tensor_stereo.datasets.synthetic import SyntheticDataset
 from tensor_stereo.filters import classify_graphs
+from tensor_stereo.ops import backends
 from tensor_stereo.pipeline import ImagePair, run_pipeline
 from tensor_stereo.types import Relation
-from tests.oracles import neighbor_sets, relation_of_sets
+from tests.oracles import installed_backends, neighbor_sets, relation_of_sets
 
 EIGHT = ("Art", "Books", "Cones", "Dolls", "Laundry", "Moebius", "Reindeer", "Teddy")
 
@@ -28,7 +30,9 @@ def _assert_batch_equals_loop(pairs: list[ImagePair], config: PipelineConfig) ->
     for name in ("keypoints0", "keypoints1", "cost"):
         assert torch.equal(getattr(batch.matches, name), torch.cat([getattr(one.matches, name) for one in loop]))
     assert batch.matches.ptr.diff().tolist() == [one.matches.num_matches for one in loop]
-    for name in ("inlier", "relation", "overlap", "degree0", "degree1"):
+    assert batch.score is not None
+    torch.testing.assert_close(batch.score, torch.cat([one.score for one in loop]), rtol=0, atol=1e-4)  # type: ignore[misc]
+    for name in ("relation", "overlap", "degree0", "degree1"):
         columns = [getattr(one.classification, name) for one in loop]
         assert torch.equal(getattr(batch.classification, name), torch.cat(columns)), name
 
@@ -38,7 +42,7 @@ def _assert_oracles_agree(pairs: list[ImagePair], config: PipelineConfig) -> Non
     output = run_pipeline(pairs, config)
     graphs = output.graphs
     sets0, sets1 = neighbor_sets(graphs.adjacency0), neighbor_sets(graphs.adjacency1)
-    literal = classify_graphs(graphs, min_group_size=1)
+    literal = classify_graphs(graphs, FilterConfig(min_group_size=1))
     expected = [relation_of_sets(n0, n1) for n0, n1 in zip(sets0, sets1, strict=True)]
     alone = graphs.group_size == 1
     untested = (graphs.group_size == 0) | (~alone & ((literal.degree0 == 0) | (literal.degree1 == 0)))
@@ -78,6 +82,62 @@ def test_eight_scenes_in_one_batch_equal_eight_runs_and_the_oracles(detector: De
         _assert_oracles_agree(pairs, config)
 
 
+class Unusable:
+    """In the place of the compiled module: whoever asks for a kernel fails."""
+
+    def __getattr__(self, name: str) -> object:
+        raise AssertionError(f"the kernel {name} ran under backend='scipy'")
+
+
+@pytest.mark.parametrize("score", ["learned", "consensus", "topology"])
+def test_under_scipy_no_kernel_runs_from_images_to_verdicts(score: Score, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = SyntheticDataset(1)[0]
+    pairs = [(pair.image0[:, :120, :160], pair.image1[:, :120, :160])]
+    gates = MatchingConfig(max_row_offset_px=1, min_disparity_px=0, max_disparity_px=64)
+    configs = [
+        PipelineConfig(backend=backend, score=score, threshold=0.4, matching=gates, constrained=constrained)
+        for constrained in (False, True)
+        for backend in ("auto", "scipy")
+    ]
+    native = [run_pipeline(pairs, config) for config in configs[::2]]
+    monkeypatch.setattr(backends, "kernels", Unusable())
+    for config, expected in zip(configs[1::2], native, strict=True):
+        output = run_pipeline(pairs, config)
+        assert torch.equal(output.classification.relation, expected.classification.relation)
+        torch.testing.assert_close(output.score, expected.score, rtol=0, atol=1e-6)
+    if installed_backends()[0] == "native":
+        with pytest.raises(AssertionError, match=r"the kernel .* ran"):
+            run_pipeline(pairs, configs[0])
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_the_default_dtype_of_torch_changes_nothing(detector: Detector) -> None:
+    pair = SyntheticDataset(1)[0]
+    pairs = [(pair.image0[:, :150, :200], pair.image1[:, :150, :200])]
+    configs = [
+        PipelineConfig(detector=detector, constrained=True),
+        PipelineConfig(detector=detector, score="consensus", matching=MatchingConfig(max_row_offset_px=1)),
+        PipelineConfig(detector=detector, verdict="cardinality", score="topology"),
+    ]
+    expected = [run_pipeline(pairs, config) for config in configs]
+    torch.set_default_dtype(torch.float64)
+    try:
+        for config, before in zip(configs, expected, strict=True):
+            found = run_pipeline(pairs, config)
+            for name in ("keypoints0", "keypoints1", "cost"):
+                assert getattr(found.matches, name).dtype == torch.float32
+                assert torch.equal(getattr(found.matches, name), getattr(before.matches, name)), name
+            assert torch.equal(found.classification.relation, before.classification.relation)
+            assert found.score.dtype == before.score.dtype
+            assert torch.equal(found.score, before.score)
+        module = DelaunayFilter(trainable=True)
+        output = module(before.matches, images0=pairs[0][0], images1=pairs[0][1])
+        assert output.score.dtype == torch.float32
+        assert {parameter.dtype for parameter in module.parameters()} == {torch.float32}
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 @pytest.mark.parametrize("detector", DETECTORS)
 def test_constant_and_tiny_images_give_empty_results(detector: Detector) -> None:
     config = PipelineConfig(detector=detector, constrained=True)
@@ -111,4 +171,4 @@ def test_a_true_disparity_is_kept_more_often_than_a_wrong_one() -> None:
     output = run_pipeline([(pair.image0, pair.image1) for pair in dataset])
     truth = matches_against_gt(output.matches, [pair.disparity_gt for pair in dataset])  # type: ignore[misc]
     rates = match_rates(output.classification.inlier, *truth)
-    assert rates.sensitivity + rates.specificity > 1.1  # 1 is a coin toss
+    assert rates.sensitivity + rates.specificity > 1.8  # 1 is a coin toss, 2 is the truth

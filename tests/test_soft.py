@@ -181,6 +181,7 @@ def test_gradients_are_finite_everywhere(
     matches = _matches(kind, seed, n)
     leaves = [points.clone().requires_grad_() for points in (matches.keypoints0, matches.keypoints1)]
     module = ts.DelaunayFilter(
+        verdict="cardinality",
         score="topology",
         temperature=temperature,
         temperature_unit=unit,
@@ -204,7 +205,7 @@ def test_back_ends_give_the_same_gradient(kind: str) -> None:
     gradients = []
     for choice in ("native", "scipy"):
         leaf = matches.keypoints1.clone().requires_grad_()
-        ts.DelaunayFilter(score="topology", backend=choice)(
+        ts.DelaunayFilter(verdict="cardinality", score="topology", backend=choice)(
             ts.Matches(matches.keypoints0, leaf, matches.ptr)
         ).score.square().sum().backward()
         gradients.append(leaf.grad)
@@ -217,7 +218,9 @@ def test_rounding_does_not_turn_the_gradient_of_correct_matches() -> None:
     ptr = torch.tensor([0, 300])
     for noise in (0.0, 1e-12):
         right = (left - 5 + noise * torch.sin(torch.arange(600.0, dtype=torch.float64)).view(300, 2)).requires_grad_()
-        ts.DelaunayFilter(score="topology")(ts.Matches(left, right, ptr)).score.square().sum().backward()
+        ts.DelaunayFilter(verdict="cardinality", score="topology")(
+            ts.Matches(left, right, ptr)
+        ).score.square().sum().backward()
         assert float(right.grad.abs().max()) < 1e-2  # no direction is better; before, rounding chose one of size 1
 
 
@@ -225,7 +228,7 @@ def test_a_second_derivative_is_refused() -> None:
     matches = _matches("uniform", 0, 12)
     for backend in BACKENDS:
         leaf = matches.keypoints1.clone().requires_grad_()
-        score = ts.DelaunayFilter(score="topology", backend=backend)(
+        score = ts.DelaunayFilter(verdict="cardinality", score="topology", backend=backend)(
             ts.Matches(matches.keypoints0, leaf, matches.ptr)
         ).score.sum()
         (gradient,) = torch.autograd.grad(score, leaf, create_graph=True)
@@ -239,7 +242,9 @@ def test_forward_mode_is_refused() -> None:
     with torch.autograd.forward_ad.dual_level():
         dual = torch.autograd.forward_ad.make_dual(matches.keypoints1, torch.ones_like(matches.keypoints1))
         with pytest.raises(NotImplementedError, match="keypoints"):
-            ts.DelaunayFilter(score="topology")(ts.Matches(matches.keypoints0, dual, matches.ptr))
+            ts.DelaunayFilter(verdict="cardinality", score="topology")(
+                ts.Matches(matches.keypoints0, dual, matches.ptr)
+            )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -304,7 +309,7 @@ def test_half_precision_keypoints_are_refused() -> None:
         with pytest.raises(TypeError, match="keypoints"):
             soft_adjacency(points.to(dtype), torch.tensor([[0, 1]]), tie)
         with pytest.raises(TypeError, match="keypoints0"):
-            ts.DelaunayFilter(score="topology")(points[None].to(dtype), points[None].to(dtype))
+            ts.DelaunayFilter(verdict="cardinality", score="topology")(points[None].to(dtype), points[None].to(dtype))
 
 
 def test_unknown_unit_is_refused() -> None:

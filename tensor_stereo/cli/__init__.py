@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any, NoReturn
 
@@ -42,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from tensor_stereo.cli.runners import run
     from tensor_stereo.sweeps.journal import SweepError
 
+    _show_domain_warnings_in_one_line()
     try:
         code = run(command)
     except (ValueError, TypeError, ImportError, SweepError, OSError) as error:
@@ -51,6 +53,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
     if code:
         sys.exit(code)
+
+
+def _show_domain_warnings_in_one_line() -> None:
+    """Say once of each kind, as errors are said, that a score is used outside of its domain."""
+    show, seen = warnings.showwarning, set()
+
+    def show_line(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if category.__name__ != "DomainWarning":
+            show(message, category, *rest)
+            return
+        kind = str(message).partition(", but")[0]
+        if kind not in seen:
+            seen.add(kind)
+            print(f"tensor-stereo: warning: {message}", file=sys.stderr)
+
+    warnings.showwarning = show_line
 
 
 def _fail(error: Exception) -> NoReturn:

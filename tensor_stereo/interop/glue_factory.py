@@ -183,7 +183,7 @@ class GlueFactoryFilter(nn.Module):
             and ``data["view1"]["image"]``, if they are there; it expects rectified pairs.
 
     Example:
-        >>> x, y = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="xy")
+        >>> x, y = torch.meshgrid(torch.arange(0.0, 40, 10), torch.arange(0.0, 40, 10), indexing="xy")
         >>> points = torch.stack([x, y], -1).reshape(1, 16, 2)
         >>> data = {"keypoints0": points, "keypoints1": points - 1, "matches0": torch.arange(16)[None]}
         >>> bool((GlueFactoryFilter()(data)["matches0"] == data["matches0"]).all())

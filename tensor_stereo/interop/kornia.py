@@ -247,7 +247,7 @@ def filter_matches(
         ValueError, TypeError: as :func:`from_lafs`.
 
     Example:
-        >>> x, y = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="xy")
+        >>> x, y = torch.meshgrid(torch.arange(0.0, 40, 10), torch.arange(0.0, 40, 10), indexing="xy")
         >>> centres = torch.stack([x, y], -1).reshape(1, 16, 2, 1)
         >>> lafs = torch.cat([torch.eye(2).expand(1, 16, 2, 2), centres], -1)
         >>> distances, indices = filter_matches(lafs, lafs + 1, torch.arange(16)[:, None].expand(16, 2))
@@ -302,7 +302,7 @@ class FilteredMatcher(nn.Module):
         >>> def match(desc1, desc2):
         ...     distances, partner = nearest(desc1, desc2)
         ...     return distances, torch.cat([torch.arange(len(desc1))[:, None], partner], 1)
-        >>> x, y = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="xy")
+        >>> x, y = torch.meshgrid(torch.arange(0.0, 40, 10), torch.arange(0.0, 40, 10), indexing="xy")
         >>> located = torch.stack([torch.arange(16.0), x.flatten(), y.flatten()], 1)  # descriptor, x, y
         >>> FilteredMatcher(match)(located, located + torch.tensor([0.0, 5.0, 0.0]))[1].shape
         torch.Size([16, 2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from tensor_stereo.atomic import whole_file
@@ -54,8 +54,9 @@ def filter_file(
         source: file of putative matches. It is not changed.
         out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced.
         keypoints: hloc's file of features; for ``.h5`` only.
-        config: Settings of verdict and score, the same for all forms; None or a
-            :class:`~tensor_stereo.configs.FileFilterConfig` leaves the verdict to the form of the file.
+        config: Settings of verdict and score; None, or ``verdict=None`` of a
+            :class:`~tensor_stereo.configs.FileFilterConfig`, leaves the verdict to the form of the file. In files of
+            any two views, ``consensus`` looks at no row offset unless its settings are given.
 
     Returns:
         Counts of pairs and matches.
@@ -77,11 +78,9 @@ def filter_file(
         (4, ['x0,y0,x1,y1,inlier,relation', '0,0,-3,0,true,equal'])
     """
     ending = _check_files(source, out, keypoints)
-    if config is None:
-        config = FileFilterConfig()
-    if isinstance(config, FileFilterConfig):
-        is_indexed = ending == ".npz" and holds_indices(source)
-        config = config.resolve(rectified=not is_indexed and ending not in (".h5", ".db"))
+    settings = {} if config is None else {f.name: getattr(config, f.name) for f in fields(FilterConfig)}
+    of_any_views = ending in (".h5", ".db") or (ending == ".npz" and holds_indices(source))
+    config = FileFilterConfig(**settings).resolve(rectified=not of_any_views)
     if config.resolved_score == "none":
         config = replace(config, score="none")  # nobody asks for a gradient here
     run = DelaunayFilter(config)

@@ -103,15 +103,18 @@ def classify_files(
     )
 
 
-def match_table(output: PipelineOutput, config: PipelineConfig, truth: Truth | None = None) -> pl.DataFrame:
+def match_table(
+    output: PipelineOutput, config: PipelineConfig | None = None, truth: Truth | None = None
+) -> pl.DataFrame:
     """One row per match of one pair.
 
     Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained; ``inlier``, what the
     verdict of the settings says; ``probability`` of an error of at most 1 px, or ``score`` where that is none;
     ``inlier_adjacency``, ``inlier_cardinality`` and, if there is a score that can decide, ``inlier_score``;
     ``relation`` by name, ``overlap, degree0, degree1``; and with ``truth`` = (correct, valid) also ``correct``, null
-    where ground truth is not known.
+    where ground truth is not known. ``config`` is that of the output; None means the defaults.
     """
+    config = config or PipelineConfig()
     matches, verdict = output.matches, output.classification
     columns = {
         "x0": matches.keypoints0[:, 0],

@@ -160,23 +160,29 @@ def runtime_table(rows: Sequence[Row], *, restriction: Restriction = "cardinalit
 
 
 def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
-    """Run-time of the constrained variant by stage, in ms per detector, as the mean over the scenes.
+    """Run-time by stage, in ms, as the mean over the scenes: the constrained variant, and the verdict of the score.
 
     Example:
         >>> record = dict(scene="Art", detector="fast", variant="constrained", verdict="cardinality")
         >>> stage_table([record | {"seconds": {"detect": 0.01, "match": 0.02}}]).text_rows()
-        [['FAST', '10.0', '20.0', '30.0']]
+        [['FAST, constrained', '10.0', '20.0', '30.0']]
     """
-    records = _index_variant(rows, restriction, "constrained")
-    spent = [item for record in records.values() for item in _field(record, "seconds").items()]
+    kinds = {
+        "constrained": _index_variant(rows, restriction, "constrained"),
+        "by score": _index_variant(rows, "score", "unconstrained"),
+    }
+    records = [record for found in kinds.values() for record in found.values()]
+    spent = [item for record in records for item in _field(record, "seconds").items()]
     stages = list(dict.fromkeys(stage for stage, value in spent if value != 0))  # those that ran
     body: list[tuple[Cell, ...]] = []
-    for detector in _detectors(records):
-        seconds = [_field(record, "seconds") for key, record in records.items() if key[1] == detector]
-        means = [1000 * _mean([scene.get(stage, math.nan) for scene in seconds]) for stage in stages]
-        total = 1000 * _mean([sum(scene.values()) for scene in seconds])
-        body.append((detector.upper(), *means, total))
-    title = f"Run-time by stage of the constrained variant in ms, {restriction}, mean over the scenes"
+    for detector in _detectors(key for found in kinds.values() for key in found):
+        for kind, found in kinds.items():
+            seconds = [_field(record, "seconds") for key, record in found.items() if key[1] == detector]
+            if seconds:
+                means = [1000 * _mean([scene.get(stage, math.nan) for scene in seconds]) for stage in stages]
+                total = 1000 * _mean([sum(scene.values()) for scene in seconds])
+                body.append((f"{detector.upper()}, {kind}", *means, total))
+    title = f"Run-time by stage in ms, {restriction} and by score, mean over the scenes"
     return Table(title, ("detector", *stages, "total"), tuple(body), decimals=1)
 
 
@@ -241,8 +247,8 @@ def _index(rows: Sequence[Row], verdict: Verdict) -> dict[Key, Row]:
     return index
 
 
-def _index_variant(rows: Sequence[Row], restriction: Restriction, variant: str) -> dict[Key, Row]:
-    return {key: record for key, record in _index(rows, restriction).items() if key[2] == variant}
+def _index_variant(rows: Sequence[Row], verdict: Verdict, variant: str) -> dict[Key, Row]:
+    return {key: record for key, record in _index(rows, verdict).items() if key[2] == variant}
 
 
 def _with_mean(body: Sequence[tuple[Cell, ...]]) -> tuple[tuple[Cell, ...], ...]:

@@ -247,7 +247,7 @@ def _window_kernels(windows: Tensor) -> Tensor:
     boxes = torch.stack([small, middle, *halves]).float().expand(len(windows), -1, -1, -1)
     center = windows[:, _RADIUS_PX - 1 : _RADIUS_PX + 2, _RADIUS_PX - 1 : _RADIUS_PX + 2].mean((1, 2))
     unlike = (windows - center[:, None, None]).abs() / _LIKENESS_LEVELS
-    similar = torch.exp(-unlike - (x.square() + y.square()) / _LIKENESS_PX2)[:, None] + 1e-4
+    similar = torch.exp(-unlike - (x.square() + y.square()).float() / _LIKENESS_PX2)[:, None] + 1e-4
     weights = torch.cat([boxes[:, :2], similar, boxes[:, 2:]], 1).flatten(2)
     return (weights / weights.sum(2, keepdim=True)).transpose(1, 2)
 

@@ -97,7 +97,7 @@ class LearnedScore(nn.Module):
 
     def infer(self, q: Quantities) -> tuple[Tensor, list[Tensor]]:
         """(M,) logits, and those after the start and each round but the last, which training looks at too."""
-        with_image = bool(q.has_image.any())
+        with_image = q.shown
         cost = self._normalize("cost", q.cost) * q.has_cost
         entered = self.enter(torch.cat([self._normalize("nodes", q.nodes), cost, q.has_cost, q.has_image], 1))
         q = q._replace(edges=self._normalize("edges", q.edges))
@@ -248,8 +248,13 @@ def score_learned(
     """
     check_fit(matches, graphs, evidence)
     network = load_learned(matches.keypoints0.device) if network is None else network
+    if torch.compiler.is_compiling():  # the lengths of the pairs are not known yet
+        _, probability = network(matches, graphs, evidence, config)
+        return probability  # type: ignore[no-any-return]
     parts = [network(*part, config)[1] for part in _parts(matches, graphs, evidence)]
-    return torch.cat(parts) if parts else matches.keypoints0.new_zeros(0, dtype=torch.float32)
+    if not parts:
+        return (matches.keypoints0 + matches.keypoints1).float()[:, 0]  # empty, with a gradient like any other
+    return torch.cat(parts)
 
 
 def _parts(

@@ -22,6 +22,8 @@ _TINY_PX2 = 1e-6  # added to squared lengths, so that their roots have a gradien
 class Receivers(NamedTuple):
     """The U pairs of neighbours in the order of their ends."""
 
+    i: Tensor  # (U,) int64 rows of one end
+    j: Tensor  # (U,) int64 rows of the other
     order_i: Tensor  # (U,) int64 pairs, by i
     offsets_i: Tensor  # (M + 1,) int64 into ``order_i``
     order_j: Tensor  # (U,) int64 pairs, by j
@@ -29,6 +31,9 @@ class Receivers(NamedTuple):
 
     def sum(self, to_i: Tensor, to_j: Tensor) -> Tensor:
         """(M, K) sums of the (U, K) messages to either end; gradients flow."""
+        if torch.compiler.is_compiling():  # embedding_bag asks for sizes that are not known yet
+            sums = to_i.new_zeros(len(self.offsets_i) - 1, to_i.shape[1])
+            return sums.index_add(0, self.i, to_i).index_add(0, self.j, to_j)
         # a gather in the order of the receivers; adding to scattered rows takes ten times as long
         sums = functional.embedding_bag(self.order_i, to_i, self.offsets_i, mode="sum", include_last_offset=True)
         other = functional.embedding_bag(self.order_j, to_j, self.offsets_j, mode="sum", include_last_offset=True)
@@ -55,6 +60,7 @@ class Quantities(NamedTuple):
     step: Tensor  # (U, 2) from i to j in view 0, over the mean distance of both to their neighbours
     receivers: Receivers
     num_pairs: int
+    shown: bool  # whether there is image evidence
 
 
 def measure_quantities(
@@ -110,7 +116,7 @@ def measure_quantities(
     centered = _center(disparity, matches.num_pairs, batch, share)[:, 0]
     return Quantities(
         nodes, cost, image, has_cost, has_image, centered, batch, share.float(), degree[:, None],
-        i, j, edges, image_i, image_j, step.t(), receivers, matches.num_pairs,
+        i, j, edges, image_i, image_j, step.t(), receivers, matches.num_pairs, evidence is not None,
     )  # fmt: skip
 
 
@@ -138,7 +144,7 @@ def find_receivers(i: Tensor, j: Tensor, num_matches: int) -> Receivers:
     for ends in (i, j):
         receiver, order = torch.sort(ends, stable=True)
         found += [order, torch.searchsorted(receiver, rows)]
-    return Receivers(*found)
+    return Receivers(i, j, *found)
 
 
 def _center(values: Tensor, num_pairs: int, batch: Tensor, share: Tensor) -> Tensor:
@@ -200,13 +206,15 @@ def _union(adjacency0: Adjacency, adjacency1: Adjacency) -> tuple[Tensor, Tensor
         row, col = adjacency.row_indices, adjacency.col_indices
         kept = (row < col).nonzero()[:, 0]
         upper.append(row.index_select(0, kept) * size + col.index_select(0, kept))
-    place = torch.searchsorted(upper[0], upper[1]).clamp_(max=len(upper[0]) - 1)
-    if len(upper[0]):
-        shared = upper[0].index_select(0, place) == upper[1]
-    else:
-        shared = torch.zeros_like(upper[1], dtype=torch.bool)
+    first = torch.cat([upper[0], upper[0].new_full((1,), -1)])  # equal to none, found beyond the last one
+    place = torch.searchsorted(upper[0], upper[1])
+    shared = first.index_select(0, place) == upper[1]
     extra = upper[1][~shared]
     keys = torch.cat([upper[0], extra])
+    if torch.compiler.is_compiling():  # a compiled linear layer needs to know that it has a row
+        torch._check(  # type: ignore[no-untyped-call]
+            keys.shape[0] >= 1, lambda: "a compiled score 'learned' needs a batch with neighbours in it"
+        )
     i = torch.div(keys, size, rounding_mode="floor")
     in0 = torch.cat([torch.ones_like(upper[0]), torch.zeros_like(extra)]).float()
     in1 = torch.cat([torch.zeros_like(upper[0]).index_fill(0, place[shared], 1), torch.ones_like(extra)]).float()

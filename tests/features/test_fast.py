@@ -73,8 +73,3 @@ def test_whole_pixel_shift_of_the_image_shifts_keypoints_and_keeps_windows(textu
     moved = interior(a, shift)
     assert len(moved) > 30
     assert moved == interior(b, torch.zeros(2))
-
-
-def test_threshold_out_of_range_is_named(textures: Tensor) -> None:
-    with pytest.raises(ValueError, match=r"FASTConfig.threshold must lie in \[0, 255\], got 256"):
-        detect_fast(textures, FASTConfig(threshold=256))

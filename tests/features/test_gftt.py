@@ -93,11 +93,3 @@ def test_whole_pixel_shift_of_the_image_shifts_keypoints(textures: Tensor) -> No
     moved = interior(a.keypoints - shift, a.scores)
     assert len(moved) > 20
     assert moved == interior(b.keypoints, b.scores)
-
-
-@pytest.mark.parametrize(
-    "config", [GFTTConfig(quality_level=0), GFTTConfig(quality_level=1.1), GFTTConfig(min_distance_px=-1)]
-)
-def test_setting_out_of_range_is_named(textures: Tensor, config: GFTTConfig) -> None:
-    with pytest.raises(ValueError, match=r"GFTTConfig\.(quality_level|min_distance_px) must lie in"):
-        detect_gftt(textures, config)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tensor_stereo.features.images import check_range, join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.images import join_images, map_images, strongest_first, to_gray
 
 
 def test_gray_uint8_is_returned_as_it_is() -> None:
@@ -94,9 +94,3 @@ def test_join_of_no_image_has_the_right_shapes() -> None:
     assert descriptors.shape == (0, 7)
     assert ptr.tolist() == [0]
     assert ptr.dtype == torch.int64
-
-
-@pytest.mark.parametrize("value", [-1, 11, float("nan")])
-def test_setting_out_of_range_is_named(value: float) -> None:
-    with pytest.raises(ValueError, match=r"FASTConfig.threshold must lie in \[0, 10\], got"):
-        check_range("FASTConfig.threshold", value, 0, 10)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tensor_stereo.configs import MatchingConfig, SIFTConfig
+from tensor_stereo.configs import PipelineConfig, SIFTConfig
 from tensor_stereo.features import detect_sift
 from tensor_stereo.matching import match_features
 
@@ -105,7 +105,7 @@ def test_matches_of_a_rectified_pair_lie_on_one_row(backend: str, data_root: Pat
     truth = cv2.imread(str(scene / "disp2.png"), cv2.IMREAD_UNCHANGED) / 4
     images = torch.from_numpy(np.stack([view0, view1]))[:, None]
     features = [detect_sift(image[None], SIFTConfig(backend=backend, max_keypoints=1000)) for image in images]  # type: ignore[arg-type]
-    matches = match_features(*features, MatchingConfig(max_ratio=0.8))
+    matches = match_features(*features, PipelineConfig(detector="sift"))
     assert (matches.keypoints0[:, 1] - matches.keypoints1[:, 1]).abs().median() < 0.2
     x, y = matches.keypoints0.round().long().unbind(1)
     expected = torch.from_numpy(truth)[y, x]

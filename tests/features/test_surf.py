@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tensor_stereo.configs import SURFConfig
 from tensor_stereo.features import detect_surf
 from tensor_stereo.features.surf import hessian_determinant, refine_maxima
 from tensor_stereo.matching import match_features
@@ -101,18 +100,3 @@ def test_correct_matches_are_placed_better_than_mahotas_places_them(data_root: P
     x, y = matches.keypoints0.round().long().unbind(1)
     error = (truth[y, x] - matches.disparity).abs()[truth[y, x] > 0]
     assert error[error < 3].median() < 0.35  # 0.25; 0.45 with mahotas' own positions
-
-
-@pytest.mark.parametrize(
-    ("config", "name"),
-    [
-        (SURFConfig(num_octaves=0), "num_octaves"),
-        (SURFConfig(num_octaves=9), "num_octaves"),
-        (SURFConfig(num_scales=2), "num_scales"),
-        (SURFConfig(initial_step_px=0), "initial_step_px"),
-        (SURFConfig(threshold=-1.0), "threshold"),
-    ],
-)
-def test_setting_out_of_range_is_named(textures: Tensor, config: SURFConfig, name: str) -> None:
-    with pytest.raises(ValueError, match=f"SURFConfig.{name} must lie in"):
-        detect_surf(textures, config)

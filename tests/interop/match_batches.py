@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from tensor_stereo import DelaunayFilter, Matches, classify_matches
+from tensor_stereo import UNRECTIFIED, DelaunayFilter, FilterConfig, Matches, classify_matches
 from tensor_stereo.batching import collate_matches
-from tensor_stereo.configs import ConsensusConfig
 from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.matchers import scene
 
@@ -28,11 +27,24 @@ def batch(seed: int, sizes: Sequence[int] = (60, 0, 1, 3, 45), *, has_group: boo
     return collate_matches(items)
 
 
-def expected(
-    matches: Matches, threshold: float | None = None, consensus: ConsensusConfig | None = None, **settings: object
-) -> Verdicts:
-    """Inlier and relation by classify_matches, the score by DelaunayFilter."""
-    verdict = classify_matches(matches, **settings)  # type: ignore[arg-type]
-    output = DelaunayFilter(threshold=threshold, consensus=consensus, **settings)(matches)  # type: ignore[arg-type]
-    inlier = verdict.inlier if threshold is None else output.inlier
-    return Verdicts(inlier.numpy(), output.score.numpy(), verdict.relation.numpy())
+def expected(matches: Matches, **settings: object) -> Verdicts:
+    """Relation, and the verdicts of the paper, by classify_matches; scores and verdicts by them by DelaunayFilter."""
+    config = FilterConfig(**settings)  # type: ignore[arg-type]
+    set_test = classify_matches(
+        matches,
+        restriction="cardinality" if config.verdict == "score" else config.verdict,
+        min_group_size=config.min_group_size,
+        tie_tolerance=config.tie_tolerance,
+        backend=config.backend,
+    )
+    inlier, score = set_test.inlier, None
+    if config.resolved_score != "none":
+        output = DelaunayFilter(config)(matches)
+        score = output.score.double().numpy()
+        inlier = output.inlier if config.verdict == "score" else inlier
+    return Verdicts(inlier.numpy(), score, set_test.relation.numpy())
+
+
+def expected_of_any_views(matches: Matches) -> Verdicts:
+    """The default of files whose pairs need not be rectified."""
+    return expected(matches, verdict="cardinality", score="consensus", consensus=UNRECTIFIED)

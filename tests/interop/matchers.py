@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tensor_stereo import DelaunayFilter, Matches
+from tensor_stereo import Matches
 from tensor_stereo.filters import FilterOutput
+from tensor_stereo.interop.glue_factory import two_view_filter
 
 
 def scene(seed: int, n: int = 60, wrong: float = 0.3) -> tuple[Tensor, Tensor]:
@@ -26,5 +27,5 @@ class SmoothFilter(nn.Module):
     """The verdicts of DelaunayFilter with a score that depends smoothly on the keypoints of view 1."""
 
     def forward(self, matches: Matches) -> FilterOutput:
-        output = DelaunayFilter()(matches)
+        output = two_view_filter()(matches)
         return replace(output, score=torch.sigmoid(matches.keypoints1.sum(1) / 500))

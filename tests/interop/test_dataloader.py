@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from tensor_stereo import DelaunayFilter, Matches, StereoPair
+from tensor_stereo import Matches, StereoPair
 from tensor_stereo.batching import collate_matches, split_matches
 from tensor_stereo.datasets import PairDataset, PairFiles, read_pair
+from tensor_stereo.interop.glue_factory import two_view_filter
 from tests.interop.matchers import scene
 
 
@@ -35,7 +36,7 @@ def collate_pairs(items: Sequence[StereoPair]) -> tuple[list[str], list[Tensor]]
 
 
 def filter_items(items: Sequence[Matches]) -> Tensor:
-    inlier: Tensor = DelaunayFilter()(collate_matches(items)).inlier
+    inlier: Tensor = two_view_filter()(collate_matches(items)).inlier
     return inlier
 
 

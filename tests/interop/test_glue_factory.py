@@ -110,8 +110,8 @@ def test_batch_equals_loop(seed: int) -> None:
 def test_filter_writes_the_verdicts_and_scores_of_the_delaunay_filter() -> None:
     data = predictions(7)
     matches, indices = from_glue_factory(data)
-    output = DelaunayFilter(restriction="adjacency")(matches)
-    result = GlueFactoryFilter(DelaunayFilter(restriction="adjacency"))(data)
+    output = DelaunayFilter(verdict="adjacency")(matches)
+    result = GlueFactoryFilter(DelaunayFilter(verdict="adjacency"))(data)
     places = indices[:, 0], indices[:, 1]
     assert torch.equal(result["matches0"][places] >= 0, output.inlier)
     expected = data["matching_scores0"][places] * output.score * output.inlier
@@ -155,19 +155,19 @@ def test_pairs_without_matches_and_empty_batches_pass() -> None:
 
 def test_configuration_names_the_filter_by_its_module_path() -> None:
     # The look-up that glue-factory's get_model does, with the dictionary of the component as argument.
-    conf = {"name": "tensor_stereo.interop.glue_factory", "restriction": "adjacency", "trainable": False}
+    conf = {"name": "tensor_stereo.interop.glue_factory", "verdict": "adjacency", "trainable": False}
     model = importlib.import_module(conf["name"]).__main_model__(conf)  # type: ignore[arg-type]
     assert isinstance(model, nn.Module)
     assert isinstance(model.filter, DelaunayFilter)
     data = predictions(5)
-    expected = GlueFactoryFilter(DelaunayFilter(restriction="adjacency"))(data)
+    expected = GlueFactoryFilter(DelaunayFilter(verdict="adjacency"))(data)
     pred = {**data, **model({**data, "view0": {"image": None}})}
     assert torch.equal(pred["matches0"], expected["matches0"])
     assert not torch.equal(pred["matches0"], GlueFactoryFilter()(data)["matches0"])
     with pytest.raises(NotImplementedError):
         model.loss(pred, data)
-    with pytest.raises(TypeError, match="restrictions"):
-        GlueFactoryFilter.from_conf({"restrictions": "adjacency"})
+    with pytest.raises(TypeError, match="verdicts"):
+        GlueFactoryFilter.from_conf({"verdicts": "adjacency"})
 
 
 @pytest.mark.parametrize(

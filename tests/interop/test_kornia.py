@@ -10,7 +10,7 @@ from kornia.feature.loftr.loftr import default_cfg
 from torch import Tensor
 
 from tensor_stereo import DelaunayFilter
-from tensor_stereo.configs import UNRECTIFIED
+from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.kornia import (
     FilteredMatcher,
     LocatedFeature,
@@ -89,7 +89,7 @@ def test_lightglue_output_comes_back_unchanged_if_all_matches_are_kept() -> None
 def test_lightglue_lists_and_indices_hold_the_same_inliers() -> None:
     data, output = run_lightglue()
     matches, indices = from_lightglue(data, output)
-    verdict = DelaunayFilter()(matches)
+    verdict = two_view_filter()(matches)
     assert 0 < int(verdict.inlier.sum()) < len(indices)
     back = to_lightglue(output, indices, verdict.inlier, verdict.score)
     again, kept = from_lightglue(data, back)
@@ -111,7 +111,7 @@ def test_lightglue_without_keypoints_has_no_matches() -> None:
     output = model(data)
     matches, indices = from_lightglue(data, output)
     assert matches.ptr.tolist() == [0, 0, 0]
-    assert bool((to_lightglue(output, indices, DelaunayFilter()(matches).inlier)["matches0"] == -1).all())
+    assert bool((to_lightglue(output, indices, two_view_filter()(matches).inlier)["matches0"] == -1).all())
     with pytest.raises(ValueError, match="image1"):
         from_lightglue({"image0": data["image0"]}, output)
 
@@ -127,7 +127,7 @@ def test_loftr_rows_become_ragged_pairs_and_come_back(loftr_output: dict[str, Te
 
 
 def test_loftr_inliers_are_those_of_each_pair_alone(loftr_output: dict[str, Tensor]) -> None:
-    verdict = DelaunayFilter()(from_loftr(loftr_output))
+    verdict = two_view_filter()(from_loftr(loftr_output))
     kept = to_loftr(loftr_output, verdict.inlier, verdict.score)
     assert 0 < len(kept["confidence"]) < len(loftr_output["confidence"])
     for b in range(2):
@@ -136,7 +136,7 @@ def test_loftr_inliers_are_those_of_each_pair_alone(loftr_output: dict[str, Tens
             "batch_indexes": torch.zeros(rows.sum())
         }
         pair["batch_indexes"] = pair["batch_indexes"].long()
-        alone = DelaunayFilter()(from_loftr(pair))
+        alone = two_view_filter()(from_loftr(pair))
         here = kept["batch_indexes"] == b
         assert torch.equal(kept["keypoints0"][here], pair["keypoints0"][alone.inlier])
         assert torch.equal(kept["confidence"][here], (pair["confidence"] * alone.score)[alone.inlier])
@@ -184,13 +184,13 @@ def test_batched_indices_of_kornia_give_the_pairs_one_by_one() -> None:
 @pytest.mark.parametrize("mode", ["nn", "snn"])
 def test_filter_matches_keeps_the_rows_of_the_inliers(mode: str) -> None:
     lafs1, lafs2, distances, indices = matched_by_snn(1, mode)
-    verdict = DelaunayFilter(consensus=UNRECTIFIED)(from_lafs(lafs1, lafs2, indices, distances))
+    verdict = two_view_filter()(from_lafs(lafs1, lafs2, indices, distances))
     kept_distances, kept = filter_matches(lafs1, lafs2, indices, distances=distances)
     assert 0 < len(kept) < len(indices)
     assert torch.equal(kept, indices[verdict.inlier])
     assert kept_distances.shape == (len(kept), 1)
     assert torch.equal(kept_distances[:, 0], 1 - verdict.score[verdict.inlier])
-    strict = filter_matches(lafs1, lafs2, indices, distances=distances, filter=DelaunayFilter(restriction="adjacency"))
+    strict = filter_matches(lafs1, lafs2, indices, distances=distances, filter=DelaunayFilter(verdict="adjacency"))
     assert len(strict[1]) < len(kept)
 
 
@@ -242,7 +242,7 @@ def test_filtered_matcher_in_local_feature_matcher_gives_the_inliers_of_its_plai
     with torch.no_grad():
         plain = kf.LocalFeatureMatcher(feature, matcher)(images)
         filtered = kf.LocalFeatureMatcher(LocatedFeature(feature), FilteredMatcher(matcher))(images)
-    verdict = DelaunayFilter(consensus=UNRECTIFIED)(from_loftr(plain))
+    verdict = two_view_filter()(from_loftr(plain))
     expected = to_loftr(plain, verdict.inlier)
     assert filtered.keys() == expected.keys()
     for name in ("keypoints0", "keypoints1", "lafs0", "lafs1", "batch_indexes"):

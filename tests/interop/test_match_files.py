@@ -10,16 +10,16 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tensor_stereo import DelaunayFilter, Matches
+from tensor_stereo import UNRECTIFIED, DelaunayFilter, Matches
 from tensor_stereo.batching import ptr_to_batch, split_matches
-from tensor_stereo.configs import UNRECTIFIED, ClassifyConfig, PipelineConfig
+from tensor_stereo.configs import FileFilterConfig, FilterConfig, PipelineConfig
 from tensor_stereo.interop import match_files
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.verdicts import Verdicts
-from tests.interop.match_batches import batch, expected
+from tests.interop.match_batches import batch, expected, expected_of_any_views
 
 ENDINGS = (".npz", ".csv", ".parquet", ".h5", ".db")
-SET_TEST = {"restriction": "adjacency", "min_group_size": 1, "tie_tolerance": 0.01, "backend": "scipy"}
+SET_TEST = {"verdict": "adjacency", "min_group_size": 1, "tie_tolerance": 0.01, "backend": "scipy"}
 
 
 def write_source(folder: Path, ending: str, matches: Matches) -> dict[str, Any]:
@@ -97,7 +97,8 @@ def test_all_formats_get_the_verdicts_of_one_batch(tmp_path: Path, ending: str) 
     arguments = write_source(tmp_path, ending, matches)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     summary = filter_file(**arguments)
-    assert_verdicts(arguments["out"], summary, expected(matches))
+    wanted = expected_of_any_views(matches) if ending in (".h5", ".db") else expected(matches)
+    assert_verdicts(arguments["out"], summary, wanted)
     assert summary.num_pairs == (5 if ending in (".npz", ".h5", ".db") else 4)  # a table has no pairs without rows
     assert {path: path.read_bytes() for path in before} == before
     assert files(tmp_path) == sorted([*(path.name for path in before), f"out{ending}"])
@@ -108,22 +109,56 @@ def test_settings_reach_the_filter(tmp_path: Path, ending: str) -> None:
     matches = batch(1, [60])
     matches = Matches(*(points.float().double() for points in (matches.keypoints0, matches.keypoints1)), matches.ptr)
     arguments = write_source(tmp_path, ending, matches)
-    config = ClassifyConfig(**SET_TEST)  # type: ignore[arg-type]
-    consensus = UNRECTIFIED if ending in (".h5", ".db") else None
+    config = FilterConfig(**SET_TEST)  # type: ignore[arg-type]
+    of_any_views = ending in (".h5", ".db")
     assert_verdicts(
         arguments["out"],
         filter_file(**arguments, config=config),
-        expected(matches, consensus=consensus, **SET_TEST),
+        expected(matches, **SET_TEST),
     )
-    pipeline = PipelineConfig(restriction="adjacency")
+    pipeline = PipelineConfig(verdict="adjacency")
     summary = filter_file(**arguments, config=pipeline)
-    assert_verdicts(arguments["out"], summary, expected(matches, consensus=consensus, restriction="adjacency"))
-    summary = filter_file(**arguments, config=ClassifyConfig(threshold=0.5))  # replaces what is there
-    assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.5, consensus=consensus))
-    for settings in ({"score": "learned"}, {"score": "topology", "temperature": 0.3}, {"min_precision": 0.8}):
-        filter_file(**arguments, config=ClassifyConfig(**settings))  # type: ignore[arg-type]
-        output = DelaunayFilter(**settings, consensus=consensus)(matches)  # type: ignore[arg-type]
-        assert read_inliers(arguments["out"]) == output.inlier.tolist()
+    assert_verdicts(arguments["out"], summary, expected(matches, verdict="adjacency"))
+    views = {"consensus": UNRECTIFIED} if of_any_views else {}
+    summary = filter_file(**arguments, config=FilterConfig(threshold=0.6))  # replaces what is there
+    assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.6, **views))
+    for settings in (
+        {"score": "learned"},
+        {"score": "topology", "temperature": 0.3, "threshold": 0.4},
+        {"min_precision": 0.8, "score": "consensus"},
+    ):
+        for config in (FilterConfig(**settings), FileFilterConfig(**settings, verdict="score")):  # type: ignore[arg-type]
+            filter_file(**arguments, config=config)
+            output = DelaunayFilter(**settings, **views)(matches)  # type: ignore[arg-type]
+            assert read_inliers(arguments["out"]) == output.inlier.tolist()
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_form_of_a_file_chooses_the_verdict_that_is_left_open(tmp_path: Path, ending: str) -> None:
+    matches = batch(1, [60])
+    matches = Matches(*(points.float().double() for points in (matches.keypoints0, matches.keypoints1)), matches.ptr)
+    arguments = write_source(tmp_path, ending, matches)
+    of_any_views = ending in (".h5", ".db")
+    by_form = "cardinality" if of_any_views else "score"
+    for config in (None, FileFilterConfig(), FileFilterConfig(min_group_size=5)):
+        filter_file(**arguments, config=config)
+        verdict = DelaunayFilter(verdict=by_form, min_group_size=5 if config and config.min_group_size == 5 else 4)
+        assert read_inliers(arguments["out"]) == verdict(matches).inlier.tolist()
+    if of_any_views:
+        with pytest.raises(ValueError, match="min_precision needs the verdict 'score', got 'cardinality'"):
+            filter_file(**arguments, config=FileFilterConfig(min_precision=0.9))
+    filter_file(**arguments, config=FileFilterConfig(verdict="score", score="consensus"))
+    by_score = DelaunayFilter(score="consensus", **({"consensus": UNRECTIFIED} if of_any_views else {}))(matches)
+    assert read_inliers(arguments["out"]) == by_score.inlier.tolist()
+
+
+def test_archives_with_partners_are_taken_for_pairs_of_any_two_views(tmp_path: Path) -> None:
+    matches = batch(1, [60])
+    source, out = tmp_path / "in.npz", tmp_path / "out.npz"
+    left, right = both(matches)
+    np.savez(source, keypoints0=left, keypoints1=right, matches0=np.arange(60))
+    filter_file(source, out)
+    assert read_inliers(out) == DelaunayFilter(verdict="cardinality")(matches).inlier.tolist()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -183,10 +218,6 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         filter_file(tmp_path / "folder.csv", out)
     with pytest.raises(FileNotFoundError, match="out: there is no folder"):
         filter_file(source, tmp_path / "none" / "out.csv")
-    with pytest.raises(ValueError, match="score must be one of"):
-        filter_file(source, out, config=ClassifyConfig(score="none"))
-    with pytest.raises(ValueError, match="restriction must be"):
-        filter_file(source, out, config=ClassifyConfig(restriction="none"))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("ending", [".npz", ".parquet", ".h5", ".db"])

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 
 import pytest
 import torch
@@ -10,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import forward_ad
 
-from tensor_stereo import Matches
-from tensor_stereo.configs import ConsensusConfig
+from tensor_stereo import UNRECTIFIED, ConsensusConfig, FilterConfig, Matches
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.calibration import calibrate_consensus
+from tensor_stereo.scores.consensus import consensus_belief, consensus_score
 from tests.oracles import installed_backends
 
 BACKENDS = installed_backends()
@@ -30,8 +29,9 @@ def _matches(seed: int, num_matches: int, *, whole: bool = False) -> Matches:
     return Matches(left, right, torch.tensor([0, num_matches // 3, num_matches]), cost)
 
 
-def _score(matches: Matches, backend: str, **settings: float | None) -> torch.Tensor:
-    return consensus_score(matches, build_match_graphs(matches), ConsensusConfig(**settings), backend=backend)
+def _belief(matches: Matches, backend: str, **settings: float | None) -> torch.Tensor:
+    config = FilterConfig(consensus=ConsensusConfig(**settings), backend=backend)  # type: ignore[arg-type]
+    return consensus_belief(matches, build_match_graphs(matches), config)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -40,7 +40,7 @@ def test_order_shift_and_exchange_of_views_change_nothing(backend: str, seed: in
     matches = _matches(seed, n, whole=whole)
     if whole:  # which duplicate is kept depends on the order, for equal costs
         matches = dataclasses.replace(matches, cost=torch.arange(n, dtype=torch.float64) / n)
-    score = _score(matches, backend)
+    score = _belief(matches, backend)
     assert score.min() >= 0
     assert score.max() <= 1
     bounds = matches.ptr.tolist()
@@ -49,7 +49,17 @@ def test_order_shift_and_exchange_of_views_change_nothing(backend: str, seed: in
     shuffled = Matches(matches.keypoints0[order], matches.keypoints1[order], matches.ptr, matches.cost[order])
     moved = dataclasses.replace(matches, keypoints0=matches.keypoints0 + 1024, keypoints1=matches.keypoints1 + 1024)
     for other, expected in ((shuffled, score[order]), (moved, score), (matches.swap(), score)):
-        torch.testing.assert_close(_score(other, backend), expected, rtol=0, atol=1e-9)
+        torch.testing.assert_close(_belief(other, backend), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("settings", [ConsensusConfig(slope=0.3), UNRECTIFIED])
+def test_the_score_is_the_calibrated_belief_of_its_own_settings(backend: str, settings: ConsensusConfig) -> None:
+    matches, config = _matches(5, 60), FilterConfig(consensus=settings, backend=backend)  # type: ignore[arg-type]
+    graphs = build_match_graphs(matches)
+    belief, score = consensus_belief(matches, graphs, config), consensus_score(matches, graphs, config)
+    assert torch.equal(score, calibrate_consensus(belief, rectified=settings.rectified))
+    assert not torch.equal(belief, consensus_belief(matches, graphs))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -59,7 +69,7 @@ def test_a_quarter_turn_changes_nothing_without_rectification(backend: str) -> N
     turned = dataclasses.replace(
         matches, keypoints0=matches.keypoints0.flip(1) * turn, keypoints1=matches.keypoints1.flip(1) * turn
     )
-    found, expected = (_score(m, backend, row_tolerance_px=None) for m in (turned, matches))
+    found, expected = (_belief(m, backend, row_tolerance_px=None) for m in (turned, matches))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
@@ -68,8 +78,8 @@ def test_equal_displacements_are_believed_and_equal_costs_say_nothing(backend: s
     points = _matches(1, 90).keypoints0
     none = Matches(points, points - torch.tensor([7.0, 0.0]), torch.tensor([0, 30, 90]))
     equal = dataclasses.replace(none, cost=torch.full((90,), 5.0))
-    assert _score(none, backend).min() > 0.5
-    torch.testing.assert_close(_score(equal, backend), _score(none, backend), rtol=0, atol=1e-12)
+    assert _belief(none, backend).min() > 0.5
+    torch.testing.assert_close(_belief(equal, backend), _belief(none, backend), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -83,7 +93,7 @@ def test_score_has_the_dtype_of_the_keypoints_and_finite_gradients(backend: str,
     ):
         left, right = (points.to(dtype).requires_grad_(), (points + 3).to(dtype).requires_grad_())
         matches = Matches(left, right, torch.tensor([0, len(points)]), cost.to(dtype).requires_grad_())
-        score = _score(matches, backend)
+        score = _belief(matches, backend)
         assert score.dtype == dtype
         for gradient in torch.autograd.grad(score.sum(), (left, right, matches.cost)):
             assert gradient.dtype == dtype
@@ -94,21 +104,9 @@ def test_what_does_not_fit_is_refused() -> None:
     matches = _matches(3, 30)
     graphs = build_match_graphs(matches)
     with pytest.raises(ValueError, match="adjacency0 must have 30 nodes, got 12"):
-        consensus_score(matches, build_match_graphs(_matches(3, 12)))
+        consensus_belief(matches, build_match_graphs(_matches(3, 12)))
     with pytest.raises(ValueError, match="adjacency1 must have 30 nodes, got 12"):
-        consensus_score(matches, graphs._replace(adjacency1=build_match_graphs(_matches(3, 12)).adjacency1))
-    names = [field.name for field in dataclasses.fields(ConsensusConfig)]
-    for name in names[:-2]:
-        for wrong in (0, -1.0, math.nan, math.inf, "1"):
-            with pytest.raises(ValueError, match=f"ConsensusConfig.{name} must be positive and finite, got"):
-                consensus_score(matches, graphs, ConsensusConfig(**{name: wrong}))
-    with pytest.raises(ValueError, match="whole_row_tolerance_px"):
-        consensus_score(matches, graphs, ConsensusConfig(row_tolerance_px=None, whole_row_tolerance_px=None))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="cost_weight must be at least 0"):
-        consensus_score(matches, graphs, ConsensusConfig(cost_weight=-1))
-    for rounds in (0, 1.5, 2**33):
-        with pytest.raises(ValueError, match="num_rounds must be an integer from 1 to 1000"):
-            consensus_score(matches, graphs, ConsensusConfig(num_rounds=rounds))  # type: ignore[arg-type]
+        consensus_belief(matches, graphs._replace(adjacency1=build_match_graphs(_matches(3, 12)).adjacency1))
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")  # torch's own forward mode
@@ -120,7 +118,7 @@ def test_a_tangent_is_refused_instead_of_dropped() -> None:
         with forward_ad.dual_level():
             dual = forward_ad.make_dual(values, torch.ones_like(values))
             with pytest.raises(NotImplementedError, match=f"{name} carries a tangent"):
-                consensus_score(dataclasses.replace(matches, **{name: dual}), graphs)
+                consensus_belief(dataclasses.replace(matches, **{name: dual}), graphs)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -129,15 +127,15 @@ def test_costs_of_any_sign_are_evidence_and_infinite_ones_are_none(backend: str)
     assert matches.cost is not None
     below = dataclasses.replace(matches, cost=matches.cost - 5)
     least = dataclasses.replace(matches, cost=matches.cost - matches.cost.min())
-    assert _score(below, backend).isfinite().all()
+    assert _belief(below, backend).isfinite().all()
     first = slice(0, 20)  # the pairs have their own least cost
     alone = [
         Matches(m.keypoints0[first], m.keypoints1[first], torch.tensor([0, 20]), m.cost[first]) for m in (below, least)
     ]
     alone[1] = dataclasses.replace(alone[1], cost=alone[0].cost - alone[0].cost.min())
-    torch.testing.assert_close(_score(alone[0], backend), _score(alone[1], backend), rtol=0, atol=1e-12)
+    torch.testing.assert_close(_belief(alone[0], backend), _belief(alone[1], backend), rtol=0, atol=1e-12)
     endless = matches.cost.clone()
     endless[[3, 30]] = torch.tensor([torch.inf, 1.7e308], dtype=endless.dtype)
-    found = _score(dataclasses.replace(matches, cost=endless), backend, cost_weight=0.5)
+    found = _belief(dataclasses.replace(matches, cost=endless), backend, cost_weight=0.5)
     order = dataclasses.replace(matches, cost=(endless > 1e300).double())  # the same duplicates
-    torch.testing.assert_close(found, _score(order, backend, cost_weight=0.0), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found, _belief(order, backend, cost_weight=0.0), rtol=0, atol=1e-12)

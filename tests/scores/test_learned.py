@@ -148,7 +148,7 @@ def test_duplicates_and_keypoints_far_outside_are_scored() -> None:
 
 def test_number_of_images_must_fit() -> None:
     _, matches = rendered(0)
-    with pytest.raises(ValueError, match="one image per pair, got 0 and 0 for 1"):
+    with pytest.raises(ValueError, match=r"images0 must hold one image per pair \(1\), got 0"):
         measure_images([], [], matches, build_match_graphs(matches))
 
 

@@ -12,7 +12,7 @@ from tensor_stereo.filters import classify_graphs
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.metrics import match_rates
 from tensor_stereo.scores.calibration import calibrate_consensus, keep_by_target
-from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.consensus import consensus_belief
 from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.learned import load_learned
 
@@ -31,12 +31,12 @@ def find_probabilities(found: list[Putatives]) -> tuple[ts.Matches, torch.Tensor
     """All pairs as one batch, which of their matches are tested, and probabilities of being correct by name."""
     matches, network = to_matches(found, with_cost=True), load_learned()
     graphs = build_match_graphs(matches)
-    score = consensus_score(matches, graphs)
+    belief = consensus_belief(matches, graphs)
     evidence = measure_images(*to_images(found), matches, graphs)
     plain, shown = network(matches, graphs), network(matches, graphs, evidence)
     probabilities = {
-        "consensus + cost, raw": score,
-        "consensus + cost": calibrate_consensus(score),
+        "consensus + cost, raw": belief,
+        "consensus + cost": calibrate_consensus(belief),
         "learned, no images": plain[1],
         "learned, raw": torch.sigmoid(shown[0]),
         "learned": shown[1],

@@ -10,7 +10,7 @@ from accuracy_data import Putatives, to_images, to_matches
 
 import tensor_stereo as ts
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.consensus import consensus_belief
 from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.learned import score_learned
 
@@ -33,12 +33,15 @@ class OurScore(NamedTuple):
 
 def score_topology(given: Given) -> torch.Tensor:
     """The soft Jaccard index of the neighbours in both views."""
-    return ts.DelaunayFilter(score="topology")(given.matches).score
+    return ts.DelaunayFilter(verdict="cardinality", score="topology")(given.matches).score
 
 
 def score_consensus(given: Given) -> torch.Tensor:
-    """Agreement with the planes of the believed neighbours; with the cost as evidence if the matches have one."""
-    return consensus_score(given.matches, given.graphs)
+    """Agreement with the planes of the believed neighbours; with the cost as evidence if the matches have one.
+
+    The belief before calibration, which ranks alike but for ties: the probability is cut at both ends.
+    """
+    return consensus_belief(given.matches, given.graphs)
 
 
 def score_without_images(given: Given) -> torch.Tensor:

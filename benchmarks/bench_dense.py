@@ -25,7 +25,7 @@ import tensor_stereo as ts
 from tensor_stereo.datasets import find_pairs, read_calibration
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.interpolation import interpolate_disparity
-from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.consensus import consensus_belief
 from tensor_stereo.scores.evidence import measure_images
 from tensor_stereo.scores.learned import LearnedScore, load_learned
 
@@ -67,8 +67,8 @@ def score_filters(pair: GrayPair, one: Putatives, network: LearnedScore) -> Scor
     views = ([torch.from_numpy(view)[None]] for view in (pair.left, pair.right))
     peers = score_disparity(one)
     ours = {
-        "topology": ts.DelaunayFilter(score="topology")(plain).score,
-        "consensus": consensus_score(given, graphs),
+        "topology": ts.DelaunayFilter(verdict="cardinality", score="topology")(plain).score,
+        "consensus": consensus_belief(given, graphs),
         "learned": network(given, graphs, measure_images(*views, given, graphs))[1],
         "paper R1+R2": ts.classify_matches(plain, min_group_size=1).inlier,
         "none": torch.ones(plain.num_matches),

@@ -14,7 +14,9 @@ from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.matching import match_features
 from tensor_stereo.types import Features
 
-GATES = MatchingConfig(max_row_offset_px=1, min_disparity_px=0, max_disparity_px=128)
+GATED = PipelineConfig(
+    detector="fast", matching=MatchingConfig(max_row_offset_px=1, min_disparity_px=0, max_disparity_px=128)
+)
 
 
 def rows_of(features: Features) -> list[np.ndarray]:
@@ -42,8 +44,8 @@ def main() -> None:
     ]
     windows = [rows_of(view) for view in views]
     cases = {
-        "tensor_stereo gated, native": lambda: match_features(*views, GATES),
-        "tensor_stereo dense": lambda: match_features(*views),
+        "tensor_stereo gated, native": lambda: match_features(*views, GATED),
+        "tensor_stereo dense": lambda: match_features(*views, config),
         "NumPy dense": lambda: dense_numpy(windows),
         "OpenCV brute force": lambda: dense_opencv(windows),
     }

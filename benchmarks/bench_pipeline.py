@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from bench_classify import neighbor_sets
@@ -48,10 +50,11 @@ def main() -> None:
         source, pairs = "eight scenes", [PairDataset(files)[k] for k in range(len(files))]
     tensors = [(to_gray(p.image0[None])[0], to_gray(p.image1[None])[0]) for p in pairs]
     arrays = [(a[0].numpy(), b[0].numpy()) for a, b in tensors]
-    config = PipelineConfig(detector="fast", matching=GATES, score="none")
+    plain = PipelineConfig(detector="fast", verdict="cardinality")  # as the peer: no score
+    config = replace(plain, matching=GATES)
     cases = {
         "tensor_stereo, gated": lambda: run_pipeline(tensors, config),
-        "tensor_stereo, no gates": lambda: run_pipeline(tensors, PipelineConfig(detector="fast", score="none")),
+        "tensor_stereo, no gates": lambda: run_pipeline(tensors, plain),
         "OpenCV + NumPy + scipy + sets": lambda: naive(arrays),
     }
     cv2.setNumThreads(2)

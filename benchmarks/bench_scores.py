@@ -6,6 +6,7 @@ import torch
 from harness import Suite, matched_batch
 
 import tensor_stereo as ts
+from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.consensus import consensus_score
 
@@ -14,7 +15,7 @@ PAIRS, COUNT = 64, 1000
 
 def plain_consensus(matches: ts.Matches) -> torch.Tensor:
     """Native graphs, and the score in plain torch."""
-    return consensus_score(matches, build_match_graphs(matches), backend="scipy")
+    return consensus_score(matches, build_match_graphs(matches), FilterConfig(backend="scipy"))
 
 
 @torch.inference_mode()
@@ -22,7 +23,8 @@ def main() -> None:
     suite = Suite("scores")
     for kind in ("float", "integer"):
         matches = matched_batch(kind, PAIRS, COUNT)
-        filters = {name: ts.DelaunayFilter(score=name) for name in ("topology", "consensus", "learned")}
+        names = ("topology", "consensus", "learned")
+        filters = {name: ts.DelaunayFilter(verdict="cardinality", score=name) for name in names}
         cases = {"classify_matches": lambda m=matches: ts.classify_matches(m)}
         cases |= {name: lambda m=matches, f=f: f(m) for name, f in filters.items()}
         cases["consensus in plain torch"] = lambda m=matches: plain_consensus(m)

@@ -30,7 +30,7 @@ def times(suite: Suite) -> None:
         left, right = (torch.from_numpy(np.stack(view)) for view in views)
         rows0, ptr = from_padded(left)
         matches = ts.Matches(rows0, from_padded(right)[0], ptr)
-        module = ts.DelaunayFilter(score="topology")
+        module = ts.DelaunayFilter(verdict="cardinality", score="topology")
         leaf = right.clone().requires_grad_()
 
         def backward(module=module, left=left, leaf=leaf) -> None:
@@ -56,9 +56,8 @@ def accuracy(suite: Suite) -> None:
             correct, valid = matches_against_gt(matches, [pair.disparity_gt for pair in pairs], max_error_px=1.0)
             scores = {"hard": hard_jaccard(matches)}
             for temperature in TEMPERATURES:
-                scores[f"soft {temperature:g}"] = ts.DelaunayFilter(score="topology", temperature=temperature)(
-                    matches
-                ).score
+                judge = ts.DelaunayFilter(verdict="cardinality", score="topology", temperature=temperature)
+                scores[f"soft {temperature:g}"] = judge(matches).score
             for name, score in scores.items():
                 figures = []
                 for start, stop in zip(matches.ptr[:-1].tolist(), matches.ptr[1:].tolist(), strict=True):
@@ -76,6 +75,7 @@ def accuracy(suite: Suite) -> None:
 def jumps(suite: Suite, num_flips: int = 200) -> None:
     """How far scores jump where the graph of view 0 changes while one of 64 points moves on a straight way."""
     found = []
+    judge = ts.DelaunayFilter(verdict="cardinality", score="topology", tie_tolerance=0)
     for seed in range(num_flips):
         left, right = (torch.from_numpy(view) for view in matched_points("float", 64, seed))
         ptr, row = torch.tensor([0, 64]), seed % 64
@@ -85,7 +85,7 @@ def jumps(suite: Suite, num_flips: int = 200) -> None:
             moved = left.clone()
             moved[row] += share * way
             edges = ts.build_graphs(moved, ptr, tie_tolerance=0).col_indices.tolist()
-            return edges, ts.DelaunayFilter(score="topology", tie_tolerance=0)(ts.Matches(moved, right, ptr)).score
+            return edges, judge(ts.Matches(moved, right, ptr)).score
 
         low, high = 0.0, 1.0
         if at(low)[0] == at(high)[0]:

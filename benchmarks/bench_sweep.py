@@ -25,7 +25,8 @@ from tensor_stereo.sweeps import SweepProgress, build_plan, run_sweep
 from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
 from tensor_stereo.sweeps.units import UnitResult, run_tasks
 
-CONFIG = SweepConfig((TrialConfig(detector="fast"),))
+SETTINGS = {"detector": "fast", "verdict": "cardinality", "score": "consensus"}
+CONFIG = SweepConfig((TrialConfig(**SETTINGS),))
 NUM_UNITS = 3000  # more than a minute on one worker
 ROUNDS = 2
 
@@ -111,7 +112,7 @@ def main() -> None:
         with RunStore(folder / "run", known, pl.read_parquet(many)) as store:
             for unit in range(10_000):
                 store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0}]))
-        (folder / "sweep.toml").write_text('[grid]\ndetector = "fast"\n')
+        (folder / "sweep.toml").write_text("[grid]\n" + "".join(f'{k} = "{v}"\n' for k, v in SETTINGS.items()))
         command = [sys.executable, "-m", "tensor_stereo", "sweep", str(folder / "sweep.toml")]
         command += ["--manifest", str(many), "--out", str(folder / "run")]
         resumed = []

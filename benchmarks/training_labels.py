@@ -70,7 +70,7 @@ def find_putatives(pairs: Sequence[ts.StereoPair]) -> Putatives:
     gray = to_gray_pairs([(pair.image0, pair.image1) for pair in pairs])
     matches = match_pairs(gray, PUTATIVES, Stopwatch())
     correct, valid = matches_against_gt(matches, [pair.disparity_gt for pair in pairs])
-    verdict = ts.DelaunayFilter(score="topology", restriction="cardinality")(matches)
+    verdict = ts.DelaunayFilter(verdict="cardinality", score="topology")(matches)
     deviation = median_deviation(matches)
     threshold = choose_threshold(deviation, correct, valid)
     weights = {

@@ -74,7 +74,7 @@ def refine(
     free = start.new_tensor([1.0, 1.0 if axes == "xy" else 0.0])
     offset = torch.zeros_like(start, requires_grad=True)
     reference = sample_windows(image0, keypoints0, config.window_px)
-    judge = ts.DelaunayFilter(score="topology", restriction="cardinality")
+    judge = ts.DelaunayFilter(verdict="cardinality", score="topology")
     optimizer = torch.optim.Adam([offset], lr=config.learning_rate_px)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
     for _ in range(config.steps):

@@ -207,7 +207,9 @@ class TrialRunner:
             "relate",
             lambda: classify_graphs(graphs, trial),
         )
-        score = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
+        score = None
+        if trial.resolved_score != "none":
+            score = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
         if score is not None:
             verdict, score = apply_score(verdict, score, matches.ptr, trial)
         return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, seconds)

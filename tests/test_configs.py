@@ -180,3 +180,16 @@ def test_old_names_fail_with_the_new_one() -> None:
         ts.DelaunayFilter(treshold=0.5)
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = configs.Nothing
+
+
+def test_files_of_any_two_views_look_at_no_rows_unless_they_are_told_to() -> None:
+    loose = configs.FileFilterConfig()
+    assert loose.resolve(rectified=True) == FilterConfig()
+    of_any_views = loose.resolve(rectified=False)
+    assert (of_any_views.verdict, of_any_views.score) == ("cardinality", "consensus")
+    assert of_any_views.consensus == ts.UNRECTIFIED
+    by_score = configs.FileFilterConfig(verdict="score").resolve(rectified=False)
+    assert (by_score.resolved_score, by_score.consensus) == ("consensus", ts.UNRECTIFIED)
+    assert configs.FileFilterConfig(verdict="adjacency").resolve(rectified=False).resolved_score == "none"
+    told = ts.ConsensusConfig(row_tolerance_px=5.0)
+    assert configs.FileFilterConfig(consensus=told).resolve(rectified=False).consensus == told

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tensor_stereo.batching import collate_matches, select_matches, split_matches, to_padded
-from tensor_stereo.filters import classify_matches
+from tensor_stereo.configs import FilterConfig
+from tensor_stereo.filters import apply_score, classify_matches
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.types import Classification, Matches, Relation
@@ -212,3 +213,18 @@ def test_split_matches_is_the_inverse_of_collate_matches() -> None:
     for one, back in zip(pairs, split_matches(collate_matches(pairs)), strict=True):
         assert torch.equal(one.keypoints1, back.keypoints1)
         assert torch.equal(one.ptr, back.ptr)
+
+
+def test_the_default_threshold_is_one_half_and_included() -> None:
+    matches = random_pair("float", 1, 40)
+    verdict = classify_matches(matches)
+    tested = verdict.relation != Relation.UNTESTED
+    score = torch.full((40,), 0.5)
+    score[::3], score[1::3] = 0.4999, 0.5001
+    decided, shown = apply_score(verdict, score, matches.ptr)
+    assert torch.equal(decided.inlier, tested & (torch.arange(40) % 3 > 0))
+    assert torch.equal(shown, torch.where(tested, score, 0))
+    for restriction in ("adjacency", "cardinality"):
+        assert torch.equal(verdict.inlier_of(restriction), classify_matches(matches, restriction=restriction).inlier)
+        kept, _ = apply_score(verdict, score, matches.ptr, FilterConfig(verdict="cardinality", score="learned"))
+        assert torch.equal(kept.inlier, verdict.inlier)

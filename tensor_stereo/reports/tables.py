@@ -182,7 +182,8 @@ def stage_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality"
                 means = [1000 * _mean([scene.get(stage, math.nan) for scene in seconds]) for stage in stages]
                 total = 1000 * _mean([sum(scene.values()) for scene in seconds])
                 body.append((f"{detector.upper()}, {kind}", *means, total))
-    title = f"Run-time by stage in ms, {restriction} and by score, mean over the scenes"
+    kind = f"{restriction} and by score" if kinds["by score"] else restriction
+    title = f"Run-time by stage in ms, {kind}, mean over the scenes"
     return Table(title, ("detector", *stages, "total"), tuple(body), decimals=1)
 
 

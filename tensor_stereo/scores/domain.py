@@ -16,7 +16,8 @@ from tensor_stereo.types import Matches
 MAX_PX = 2.0**24  # beyond it float32 does not tell neighbouring pixels apart
 _LEAST_SPAN_PX = 4.0  # of the keypoints of a pair; normalised coordinates span 1 or 2
 _LEAST_MATCHES = 8  # fewer say nothing about their pair
-_SHARED = 3  # neighbours in both views that make a match one that agrees
+_SHARED = 3  # neighbours in both views that make a match one that agrees,
+_LEAST_GROUP = 16  # in a group of at least so many: small ones are almost complete graphs, and agree by themselves
 _MAX_ROW_SHIFT_PX = 0.75  # median of y0 - y1 over the matches that agree
 _MAX_ROW_OFFSET_PX = 2.0  # median of |y0 - y1| over them; a rotated view has offsets of both signs
 
@@ -85,7 +86,7 @@ def _spans(matches: Matches, batch: Tensor) -> Tensor:
 def _pairs_off_their_rows(matches: Matches, graphs: MatchGraphs, batch: Tensor, config: FilterConfig) -> list[int]:
     """Pairs with so many matches that share neighbours, most of which lie above, or below, or far from their rows."""
     overlap = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=config.backend).overlap
-    agrees = overlap >= _SHARED
+    agrees = (overlap >= _SHARED) & (graphs.group_size >= _LEAST_GROUP)
     shift = matches.keypoints0[:, 1] - matches.keypoints1[:, 1]
     conditions = (
         agrees,

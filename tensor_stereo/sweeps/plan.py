@@ -73,7 +73,9 @@ class Plan:
             keys = [stage_keys(trial) for trial in trials]
             runs = {stage: len({key[stage] for key in keys}) for stage in STAGES}
             runs["group"] = len({key["group"] for key in keys if "label" in key})
-            runs["score"] = len({key["score"] for key, t in zip(keys, trials, strict=True) if t.score != "none"})
+            runs["score"] = len(
+                {key["score"] for key, t in zip(keys, trials, strict=True) if t.resolved_score != "none"}
+            )
             row = {"features": number, "detector": trials[0].detector, "units": len(self.pairs), "trials": len(group)}
             rows.append(row | runs)
         return pl.DataFrame(rows)

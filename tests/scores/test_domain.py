@@ -61,6 +61,13 @@ def test_rectified_pairs_with_wrong_matches_are_not_marked(wrong: float) -> None
     assert not marks(wrong_rows(0.0, wrong))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_small_groups_that_agree_by_themselves_are_no_evidence(seed: int) -> None:
+    left, right = scene(seed, 240, 0.9)
+    group = torch.arange(240) % 40  # six matches each
+    assert not marks(ts.Matches(left, right, torch.tensor([0, 240]), group=group))
+
+
 def test_noise_of_either_sign_is_no_row_offset() -> None:
     left = scene(3, 200)[0]
     noise = 1.3 * torch.randn(200, 2, generator=torch.Generator().manual_seed(0))

@@ -21,16 +21,29 @@ def test_rendered_pairs_are_indexed(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_what_classify_wrote_is_filtered_alike(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["render", str(tmp_path), "--num-pairs", "1"])
     images = [str(tmp_path / f"synthetic-00-{view}.png") for view in (0, 1)]
-    main(["classify", *images, "--out", str(tmp_path / "matches.csv")])
+    main(["classify", *images, "--out", str(tmp_path / "matches.csv"), "--verdict", "cardinality"])
     capsys.readouterr()
-    main(["filter", str(tmp_path / "matches.csv"), "--out", str(tmp_path / "filtered.csv")])
+    main(["filter", str(tmp_path / "matches.csv"), "--out", str(tmp_path / "filtered.csv"), "--verdict", "cardinality"])
     printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
     before, after = pl.read_csv(tmp_path / "matches.csv"), pl.read_csv(tmp_path / "filtered.csv")
     assert before["inlier"].equals(after["inlier"])
     assert int(printed["num_kept"]) == before["inlier"].sum()
     strict = tmp_path / "strict.csv"
-    main(["filter", str(tmp_path / "matches.csv"), "--out", str(strict), "--restriction", "adjacency"])
+    main(["filter", str(tmp_path / "matches.csv"), "--out", str(strict), "--verdict", "adjacency"])
     assert 0 < pl.read_csv(strict)["inlier"].sum() < before["inlier"].sum()
+    assert pl.read_csv(strict)["inlier"].equals(before["inlier_adjacency"])
+
+
+def test_a_score_without_images_says_the_same_of_files_as_of_their_matches(tmp_path: Path) -> None:
+    main(["render", str(tmp_path), "--num-pairs", "1"])
+    images = [str(tmp_path / f"synthetic-00-{view}.png") for view in (0, 1)]
+    matches, filtered = tmp_path / "matches.parquet", tmp_path / "filtered.parquet"
+    settings = ["--score", "consensus", "--consensus.slope", "0.4", "--min-precision", "0.9"]
+    main(["classify", *images, "--out", str(matches), *settings])
+    main(["filter", str(matches), "--out", str(filtered), *settings])
+    before, after = pl.read_parquet(matches), pl.read_parquet(filtered)
+    assert before["inlier"].equals(after["inlier"])
+    assert (before["probability"] - after["score"]).abs().max() < 1e-5  # float32 there, float64 here
 
 
 @pytest.mark.slow
@@ -40,7 +53,7 @@ def test_a_run_gets_its_report(tmp_path: Path, capsys: pytest.CaptureFixture[str
     runs = []
     for window in (9, 11):
         settings = tmp_path / f"{window}.toml"
-        settings.write_text(f'[grid]\ndetector = "fast"\nfast.window_px = {window}\n')
+        settings.write_text(f'[grid]\ndetector = "fast"\nverdict = "cardinality"\nfast.window_px = {window}\n')
         runs.append(str(tmp_path / f"run{window}"))
         main(["sweep", str(settings), "--manifest", str(tmp_path / "m.parquet"), "--out", runs[-1], "--workers", "1"])
     capsys.readouterr()

@@ -7,7 +7,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import polars as pl
 import torch
 from PIL import Image
 
+from tensor_stereo.configs import ConsensusConfig
 from tensor_stereo.evaluation import ROW_SCHEMA
 from tensor_stereo.metrics import confusion_update, roc_update
 from tensor_stereo.reports.sweep.results import ERROR_COLUMNS, Overlay, RunResults
@@ -29,12 +30,13 @@ def make_grid(
     detectors: Sequence[str] = ("sift", "fast", "surf", "gftt"),
     *,
     outlier_rates: Sequence[float] = (0.0, 0.2, 0.4),
+    verdicts: Sequence[str] = ("adjacency", "cardinality"),
     scores: Sequence[str] = ("topology",),
-    thresholds: Sequence[float | None] = (None,),
+    slopes: Sequence[float] = (0.2,),
     seeds: Sequence[int] = (0,),
 ) -> list[dict[str, Any]]:
-    """Settings of every trial, by the names of the columns."""
-    axes = detectors, ("unconstrained", "constrained"), ("adjacency", "cardinality"), scores, thresholds, outlier_rates
+    """Settings of every trial, by the names of the columns; ``slopes`` are of the score consensus."""
+    axes = detectors, ("unconstrained", "constrained"), verdicts, scores, outlier_rates
     return [
         {
             "detector": detector,
@@ -46,22 +48,29 @@ def make_grid(
             "min_disparity_px": 0.0,
             "max_disparity_px": 128.0,
             "variant": variant,
-            "restriction": restriction,
+            "verdict": verdict,
             "min_group_size": 4,
             "tie_tolerance": 1e-3,
             "outlier_rate": rate,
             "noise_px": 0.0,
             "seed": seed,
             "score": score,
-            "temperature": None if score == "none" else 1.0,
-            "temperature_unit": None if score == "none" else "edge",
-            "threshold": threshold,
+            "temperature": 1.0 if score == "topology" else None,
+            "temperature_unit": "edge" if score == "topology" else None,
+            **consensus_columns(ConsensusConfig(slope=slope) if score == "consensus" else None),
+            "threshold": 0.4 if (verdict, score) == ("score", "topology") else None,
             "target_sensitivity": None,
             "min_precision": None,
         }
-        for detector, variant, restriction, score, threshold, rate in itertools.product(*axes)
+        for detector, variant, verdict, score, rate in itertools.product(*axes)
+        for slope in (slopes if score == "consensus" else (None,))
         for seed in seeds
     ]
+
+
+def consensus_columns(settings: ConsensusConfig | None) -> dict[str, Any]:
+    """The columns of the score consensus; all null for another score."""
+    return {f"consensus_{f.name}": settings and getattr(settings, f.name) for f in fields(ConsensusConfig)}
 
 
 def make_results(
@@ -102,11 +111,11 @@ def _measure(trial: dict[str, Any], pair: int, seed: int, difficulty: float, gai
         scorer.beta(1.1 + 2.0 * (1 - wrong) + 6 * helped + 4 * gain, 2.4, num_matches),
         scorer.beta(0.8, 2.6, num_matches),
     )
-    strict = 0.72 if trial["restriction"] == "adjacency" else 1.0
+    strict = 0.72 if trial["verdict"] == "adjacency" else 1.0
     chance = np.where(correct, strict * (0.15 + helped + 0.6 * (1 - wrong)), strict * (0.10 + 2 * helped))
     inlier = draw.random(num_matches) < chance
-    if trial["threshold"] is not None:
-        inlier = score >= trial["threshold"]
+    if trial["verdict"] == "score":
+        inlier = score >= (trial["threshold"] or 0.5)
     truth = torch.from_numpy(correct), torch.from_numpy(valid)
     confusion = confusion_update(torch.from_numpy(inlier), *truth)
     measured: dict[str, Any] = {"num_matches": num_matches, "num_valid": confusion.num_valid}

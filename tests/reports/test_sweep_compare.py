@@ -6,8 +6,10 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tensor_stereo.configs import ConsensusConfig
 from tensor_stereo.reports.sweep.compare import METRICS, NUM_RESAMPLES, SEED, bootstrap_means, compare_runs
-from tests.reports.sweep_results import make_grid, make_results
+from tensor_stereo.reports.sweep.pooling import setting_text
+from tests.reports.sweep_results import consensus_columns, make_grid, make_results
 
 GRID = make_grid(("sift", "fast"), outlier_rates=(0.0, 0.3))
 
@@ -122,9 +124,41 @@ def test_what_the_runs_as_a_whole_differ_in_does_not_part_them() -> None:
     }
     assert comparison.trials["trial"].to_list() == comparison.trials["trial_b"].to_list() == list(range(len(other)))
     assert set(comparison.only["detector"]) == {"fast"}
-    scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in ("topology", "consensus")]
-    assert compare_runs(*scores).changed == {"score": ("topology", "consensus")}
+    scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in ("learned", "none")]
+    assert compare_runs(*scores).changed == {"score": ("learned", "none")}
     assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
+
+
+def test_runs_of_two_scores_differ_in_the_settings_of_both() -> None:
+    names = ("topology", "consensus")
+    scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in names]
+    own = {name: ("–", setting_text(name, value)) for name, value in consensus_columns(ConsensusConfig()).items()}
+    assert len(own) == 9
+    changed = {"score": names, "temperature": ("1", "–"), "temperature_unit": ("edge", "–")} | own
+    assert compare_runs(*scores).changed == changed
+    assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
+
+
+def test_the_same_points_decided_in_another_way_are_paired() -> None:
+    runs = [make_grid(("sift", "fast"), verdicts=(name,), scores=("learned",)) for name in ("cardinality", "score")]
+    comparison = compare_runs(*(make_results(grid, num_pairs=3) for grid in runs))
+    assert comparison.changed == {"verdict": ("cardinality", "score")}
+    assert comparison.trials["trial"].to_list() == comparison.trials["trial_b"].to_list() == list(range(len(runs[0])))
+    assert comparison.only.is_empty()
+    assert (comparison.trials["auc_mean"] == 0).all()  # one score, two verdicts
+    assert (comparison.trials["sensitivity_mean"] != 0).all()
+
+
+def test_a_setting_of_consensus_parts_points_only_where_both_runs_have_several_values() -> None:
+    def run(*slopes: float) -> pl.DataFrame:
+        grid = make_grid(("fast",), outlier_rates=(0.0,), scores=("consensus",), slopes=slopes)
+        return make_results(grid, num_pairs=2)
+
+    assert compare_runs(run(0.1), run(0.3)).changed == {"consensus_slope": ("0.1", "0.3")}
+    both = compare_runs(run(0.1, 0.3), run(0.3, 0.5))
+    assert both.changed == {}
+    assert both.trials["consensus_slope"].to_list() == [0.3] * 4
+    assert sorted(both.only.select("run", "consensus_slope").unique().rows()) == [("A", 0.1), ("B", 0.5)]
 
 
 def test_runs_without_common_settings_have_no_differences() -> None:

@@ -105,6 +105,30 @@ def test_curves_and_verdicts_lie_where_the_counts_say(results: pl.DataFrame) -> 
         assert off(roc.values(star), [(0.30, 0.96)]) < 1e-3
 
 
+def test_marks_tell_how_each_verdict_was_reached() -> None:
+    """Disc, triangle and diamond, as the legend says; the diamond lies on the curve of its score."""
+    grid = make_grid(
+        ("fast",), verdicts=("score", "adjacency", "cardinality"), scores=("learned",), outlier_rates=(0.0,)
+    )
+    results = make_results(grid, num_pairs=3)
+    html = curve_figures([make_run("run", results)])
+    assert "verdict by score" in legend_texts(html)
+    roc, _ = plots(html)
+    shapes: dict[str, set[str]] = {}
+    for path in roc.svg.iter("path"):
+        place = re.match(r"trial (\d+)\n", path.findtext("title") or "")
+        if place:
+            outline = re.sub(r"^M[-\d.]+ [-\d.]+", "", path.attrib["d"])  # without where it lies
+            shapes.setdefault(grid[int(place.group(1))]["verdict"], set()).add(outline)
+    assert shapes.keys() == {"score", "adjacency", "cardinality"}
+    assert all(len(found) == 1 for found in shapes.values())
+    assert len(set.union(*shapes.values())) == 3
+    lines = [roc.values(points) for names, points, _ in roc.paths("line") if "chance" not in names]
+    for row in pool_trials(results).filter(verdict="score").iter_rows(named=True):
+        point = (1 - row["specificity"], row["sensitivity"])
+        assert min(off([point], line) for line in lines) < 2e-3
+
+
 def test_curves_of_two_runs_share_colours_and_differ_in_their_lines(results: pl.DataFrame) -> None:
     html = curve_figures([make_run("a", results), make_run("b", make_results(GRID, num_pairs=3, gain=1.0))])
     for plot in plots(html):

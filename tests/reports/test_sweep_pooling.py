@@ -15,6 +15,7 @@ from tensor_stereo.reports.sweep.pooling import (
     SETTINGS,
     VERDICT_RATES,
     best_trials,
+    decided_by_score,
     mildest,
     order_detectors,
     pool_trials,
@@ -101,22 +102,40 @@ def test_undefined_rates_leave_the_mean_and_stay_undefined(results: pl.DataFrame
 
 def test_what_varies_tells_trials_apart_and_does_not_follow_from_the_detector() -> None:
     frames = [make_results(make_grid(("fast", "sift")), num_pairs=1), make_results(make_grid(("surf",)), num_pairs=1)]
-    assert varying_settings(frames) == ["detector", "variant", "restriction", "outlier_rate"]
+    assert varying_settings(frames) == ["detector", "variant", "verdict", "outlier_rate"]
     windows = [
         make_results([trial | {"window_px": size} for trial in make_grid(("fast",))], num_pairs=1) for size in (7, 9)
     ]
-    assert varying_settings(windows) == ["window_px", "variant", "restriction", "outlier_rate"]
+    assert varying_settings(windows) == ["window_px", "variant", "verdict", "outlier_rate"]
     assert varying_settings([frames[0].clear()]) == []
+
+
+def test_settings_of_consensus_tell_trials_apart_where_they_do_not_follow_from_the_score() -> None:
+    one_slope = make_grid(("fast",), outlier_rates=(0.0,), scores=("none", "learned", "topology", "consensus"))
+    assert varying_settings([make_results(one_slope, num_pairs=1)]) == ["variant", "verdict", "score"]
+    slopes = make_grid(("fast",), outlier_rates=(0.0,), scores=("learned", "consensus"), slopes=(0.1, 0.3))
+    results = make_results(slopes, num_pairs=1)
+    assert varying_settings([results]) == ["variant", "verdict", "score", "consensus_slope"]
+    pooled = pool_trials(results)
+    assert len(pooled) == len(slopes) == 2 * 2 * 3
+    assert pooled["consensus_slope"].to_list() == [row["consensus_slope"] for row in slopes]
+    labels = [settings_label(row, ["score", "consensus_slope"]) for row in pooled[:3].iter_rows(named=True)]
+    assert labels == ["learned", "consensus, consensus slope 0.1", "consensus, consensus slope 0.3"]
 
 
 def test_labels_name_words_and_numbers() -> None:
     row: dict[str, Any] = make_grid(("sift",))[0] | {"max_ratio": None, "score": "none"}
     assert settings_label(row, ["detector", "window_px", "max_ratio", "noise_px", "score", "threshold"]) == (
-        "sift, max. ratio off, noise px 0, no score, set test"
+        "sift, max. ratio off, noise px 0, no score"
     )
+    assert settings_label(row, ["verdict", "score"]) == "adjacency, no score"
     assert settings_label(row, []) == "all settings alike"
-    aimed = row | {"score": "learned", "threshold": None, "min_precision": 0.9}
+    aimed = row | {"verdict": "score", "score": "learned", "threshold": None, "min_precision": 0.9}
     assert settings_label(aimed, ["threshold", "score", "min_precision"]) == "learned, min. precision 0.9"
+    names = ["verdict", "score", "threshold", "target_sensitivity", "min_precision"]
+    assert settings_label(aimed, names) == "by score, learned, min. precision 0.9"
+    cut = aimed | {"min_precision": None, "threshold": 0.25}
+    assert settings_label(cut, names) == "by score, learned, threshold 0.25"
 
 
 def test_mildest_perturbation_is_found_per_detector() -> None:
@@ -168,8 +187,8 @@ def test_curves_hold_every_threshold_and_the_trials_that_share_them(results: pl.
         assert {row["score"] for row in item.verdicts} == {"none"}
         assert item.curves[0].auc >= item.curves[1].auc
         for curve in item.curves:
-            assert {row["restriction"] for row in curve.trials} == {"adjacency", "cardinality"}
-            assert set(curve.fixed_settings()) == set(SETTINGS) - {"restriction", "seed"}
+            assert {row["verdict"] for row in curve.trials} == {"adjacency", "cardinality"}
+            assert set(curve.fixed_settings()) == set(SETTINGS) - {"verdict", "seed"}
             correct, incorrect = samples(results.filter(pl.col("trial") == curve.trials[0]["trial"]))
             for k, threshold in enumerate(range(-1, SCORE_BINS)):
                 rejected, lost = (incorrect <= threshold).sum(), (correct <= threshold).sum()
@@ -179,6 +198,21 @@ def test_curves_hold_every_threshold_and_the_trials_that_share_them(results: pl.
                     assert curve.ppv[k] == pytest.approx(rejected / (rejected + lost), abs=1e-12)
                 else:
                     assert math.isnan(curve.ppv[k])
+
+
+def test_a_verdict_by_score_is_a_point_of_the_curve_that_it_shares_with_the_others() -> None:
+    grid = make_grid(("fast",), verdicts=("score", "adjacency", "cardinality"), scores=("consensus", "learned"))
+    (found,) = detector_curves(make_results(grid, num_pairs=3))
+    assert len(found.curves) == 2 * 2  # of two scores, with and without objects
+    assert found.verdicts == ()
+    for curve in found.curves:
+        assert [row["verdict"] for row in curve.trials] == ["score", "adjacency", "cardinality"]
+        assert [decided_by_score(row) for row in curve.trials] == [True, False, False]
+        at = SCORE_BINS // 2  # what lies below .5 is rejected
+        by_score, *others = [(row["sensitivity"], row["specificity"], row["ppv"]) for row in curve.trials]
+        assert by_score == pytest.approx((curve.sensitivity[at], curve.specificity[at], curve.ppv[at]), rel=1e-12)
+        for other in others:
+            assert other[:2] != pytest.approx(by_score[:2], rel=1e-3)
 
 
 def test_score_without_incorrect_matches_has_no_curve(results: pl.DataFrame) -> None:

@@ -16,7 +16,8 @@ OF_THE_RUN = ("seconds", "host", "attempt")  # columns that differ between runs 
 GRID = """
 [grid]
 detector = ["fast", "gftt"]
-restriction = ["adjacency", "cardinality"]
+verdict = ["adjacency", "cardinality"]
+score = "topology"
 outlier_rate = [0.0, 0.4]
 """
 

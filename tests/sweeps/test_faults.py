@@ -21,11 +21,11 @@ from tensor_stereo.datasets import read_image, read_manifest, write_pfm
 from tensor_stereo.sweeps import SweepProgress, build_plan, expand_grid, read_errors, read_results, run_sweep
 from tensor_stereo.sweeps.engines import LocalEngine, Outcome
 from tensor_stereo.sweeps.run import MAX_DEATHS, drive
-from tensor_stereo.sweeps.store import RunStore
+from tensor_stereo.sweeps.store import FORMAT, RunStore
 from tensor_stereo.sweeps.units import run_tasks
 from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, write_pairs
 
-FAST = SweepConfig(expand_grid([{"detector": "fast"}]))
+FAST = SweepConfig(expand_grid([{"detector": "fast", "verdict": "cardinality"}]))
 PATIENCE_S = 300.0  # a worker imports torch first, beside whatever else the machine does
 SCRIPT = """
 import os, signal, sys
@@ -154,7 +154,7 @@ def test_only_the_unit_that_kills_its_worker_fails(inputs: Inputs, expected: pl.
     plan = build_plan(inputs.config, read_manifest(inputs.manifest))
     out = tmp_path / "run"
     units = list(range(plan.num_units))
-    with RunStore(out, {}, pl.DataFrame({"scene": [1]})) as store:
+    with RunStore(out, {"format": FORMAT}, pl.DataFrame({"scene": [1]})) as store:
         summary = drive(_DeadlyEngine(inputs.config, {3, 8}), plan, store, units, units)
     assert summary.progress.num_done == 12
     assert summary.progress.num_failed == 2
@@ -169,7 +169,8 @@ def test_only_the_unit_that_kills_its_worker_fails(inputs: Inputs, expected: pl.
 
 def test_a_worker_that_dies_at_work_is_noticed_and_replaced(inputs: Inputs) -> None:
     """Killed between the first byte of a result, which is larger than a pipe holds, and its last."""
-    config = SweepConfig(expand_grid([{"seed": list(range(60)), "outlier_rate": 0.5}]), export_matches=True)
+    grid = {"verdict": "cardinality", "score": "topology", "seed": list(range(60)), "outlier_rate": 0.5}
+    config = SweepConfig(expand_grid([grid]), export_matches=True)
     plan = build_plan(config, read_manifest(inputs.manifest))
     engine = LocalEngine(config, 1)
     try:

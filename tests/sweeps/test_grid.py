@@ -1,12 +1,18 @@
 from __future__ import annotations
 
+import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from tensor_stereo.configs import TrialConfig
+from tensor_stereo.configs import RESTRICTIONS, SCORES, VERDICTS, ConsensusConfig, TrialConfig
 from tensor_stereo.sweeps import expand_grid, read_grid
+from tensor_stereo.sweeps.grid import simplify
 
 
 def _read(tmp_path: Path, text: str):
@@ -26,6 +32,7 @@ def test_lists_make_a_product_and_tables_a_union(tmp_path: Path) -> None:
         [[grid]]
         detector = "sift"
         matching.max_row_offset_px = [1, "none"]
+        verdict = "cardinality"
         score = "topology"
         temperature = 2
         """,
@@ -40,7 +47,7 @@ def test_lists_make_a_product_and_tables_a_union(tmp_path: Path) -> None:
 
 
 def test_an_empty_grid_is_the_default_trial(tmp_path: Path) -> None:
-    assert _read(tmp_path, "").trials == (TrialConfig(),)
+    assert _read(tmp_path, "").trials == (simplify(TrialConfig()),) == (TrialConfig(score="learned"),)
 
 
 @pytest.mark.parametrize(
@@ -48,14 +55,36 @@ def test_an_empty_grid_is_the_default_trial(tmp_path: Path) -> None:
     [
         {"seed": [0, 1, 2]},
         {"sift": {"max_keypoints": [5, 6]}},
-        {"score": "none", "temperature": [0.5, 1.0], "temperature_unit": ["edge", "px"]},
-        {"threshold": 0.5, "restriction": ["adjacency", "cardinality"]},
-        {"min_precision": 0.5, "restriction": ["adjacency", "cardinality"]},
+        {"verdict": "cardinality", "score": "none", "temperature": [0.5, 1.0], "temperature_unit": ["edge", "px"]},
+        {"score": ["learned", "auto"], "temperature": [0.5, 1.0]},
+        {"score": "consensus", "temperature": [0.5, 1.0]},
+        {"score": "learned", "consensus": {"slope": [0.1, 0.3], "num_rounds": [2, 3]}},
+        {"verdict": "adjacency", "score": ["auto", "none"], "consensus": {"slope": [0.1, 0.3]}},
+        {"verdict": "adjacency", "score": "topology", "consensus": {"slope": [0.1, 0.3]}},
         {"objects": {"element_px": [3, 5]}},
     ],
 )
 def test_points_that_differ_only_in_unused_settings_are_one(unused: dict[str, object]) -> None:
     assert len(expand_grid([unused])) == 1
+
+
+def test_a_setting_of_consensus_is_an_axis_where_that_is_the_score() -> None:
+    axis = {"consensus": {"slope": [0.1, 0.3]}}
+    found = expand_grid([axis | {"score": "consensus"}])
+    assert [(trial.score, trial.consensus.slope) for trial in found] == [("consensus", 0.1), ("consensus", 0.3)]
+    assert all(trial.consensus == ConsensusConfig(slope=trial.consensus.slope) for trial in found)
+    both = expand_grid([axis | {"verdict": "cardinality", "score": ["none", "learned", "consensus", "topology"]}])
+    default = ConsensusConfig().slope
+    assert [(trial.score, trial.consensus.slope) for trial in both] == [
+        ("none", default), ("learned", default), ("consensus", 0.1), ("topology", default), ("consensus", 0.3)
+    ]  # fmt: skip
+
+
+def test_pairs_that_are_not_rectified_turn_auto_into_consensus(tmp_path: Path) -> None:
+    config = _read(tmp_path, '[grid]\nconsensus.row_tolerance_px = [0.25, "none"]')
+    assert [(trial.score, trial.consensus.row_tolerance_px) for trial in config.trials] == [
+        ("learned", 0.25), ("consensus", None)
+    ]  # fmt: skip
 
 
 def test_seeds_count_where_something_is_random() -> None:
@@ -82,6 +111,14 @@ def test_seeds_count_where_something_is_random() -> None:
         ("export_matches = 1", ["export_matches"]),
         ("[[grid]]\n[[grid]]\nseed = -1", ["grid 2", "seed", "-1"]),
         ("[grid", ["no TOML"]),
+        ("[grid]\nrestriction = ['adjacency', 'cardinality']", ["restriction is verdict now"]),
+        ("[[grid]]\n[[grid]]\nrestriction = 'adjacency'", ["grid 2: restriction is verdict now"]),
+        ("[grid]\nverdict = 'set'", ["verdict", "score, adjacency, cardinality", "'set'"]),
+        ("[grid]\nscore = 'best'", ["score", "auto, none, topology, consensus, learned", "'best'"]),
+        ("[grid]\nconsensus = 0.2", ["consensus must be a table"]),
+        ("[grid]\nconsensus.colour = 1", ["consensus.colour is no setting", "slope"]),
+        ("[grid]\nconsensus.slope = 'steep'", ["consensus.slope", "float", "'steep'"]),
+        ("[grid]\nscore = 'consensus'\nconsensus.slope = 0", ["ConsensusConfig.slope", "got 0"]),
     ],
 )
 def test_errors_name_file_and_setting(tmp_path: Path, text: str, words: list[str]) -> None:
@@ -96,6 +133,109 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_grid(tmp_path / "none.toml")
 
 
-def test_a_trial_needs_a_score_for_a_threshold() -> None:
-    with pytest.raises(ValueError, match="threshold"):
+def test_a_trial_needs_the_verdict_of_a_score_for_a_threshold() -> None:
+    for verdict in RESTRICTIONS:
+        for score in ("auto", "none", "learned"):
+            with pytest.raises(ValueError, match=f"threshold needs the verdict 'score', got '{verdict}'"):
+                replace(TrialConfig(), verdict=verdict, score=score, threshold=0.5)
+    with pytest.raises(ValueError, match="score must not be 'none' where the verdict is 'score'"):
         replace(TrialConfig(), score="none", threshold=0.5)
+
+
+def test_points_that_contradict_themselves_are_listed_together(tmp_path: Path) -> None:
+    text = """
+    [grid]
+    detector = "fast"
+    verdict = ["score", "adjacency", "cardinality"]
+    threshold = [0.3, 0.5, "none"]
+    """
+    with pytest.raises(ValueError, match=r"sweep\.toml") as error:
+        _read(tmp_path, text)
+    message = str(error.value)
+    assert "\n" not in message
+    assert "4 of 9 points contradict themselves, put them in tables [[grid]] of their own: " in message
+    points = message.split(" of their own: ")[1].split("; ")
+    assert [point.split(": ")[0] for point in points] == [
+        f"verdict = {verdict}, threshold = {threshold}" for verdict in RESTRICTIONS for threshold in (0.3, 0.5)
+    ]
+    assert all("threshold needs the verdict 'score'" in point for point in points)
+    tables = """
+    [[grid]]
+    detector = "fast"
+    threshold = [0.3, 0.5, "none"]
+    [[grid]]
+    detector = "fast"
+    verdict = ["adjacency", "cardinality"]
+    """
+    assert [(trial.verdict, trial.score, trial.threshold) for trial in _read(tmp_path, tables).trials] == [
+        *(("score", "learned", threshold) for threshold in (0.3, 0.5, None)),
+        *((verdict, "none", None) for verdict in RESTRICTIONS),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("score = ['topology', 'learned']", ["1 of 2 points", "score = topology: threshold must be given"]),
+        ("verdict = ['score', 'adjacency']\nscore = 'none'", ["1 of 2 points", "verdict = score: score must not be"]),
+        ("threshold = [0.1, 'none']\nmin_precision = [0.9, 'none']",
+         ["1 of 4 points", "threshold = 0.1, min_precision = 0.9: min_precision must be None beside threshold"]),
+        ("verdict = ['score', 'adjacency']\nscore = ['none', 'topology']\nthreshold = 0.5",
+         ["3 of 4 points", "verdict = score, score = none", "verdict = adjacency, score = none",
+          "verdict = adjacency, score = topology"]),
+        ("verdict = 'adjacency'\nthreshold = 0.3", ["sweep.toml: threshold needs the verdict 'score'"]),
+        ("score = 'topology'\nmin_precision = 0.9", ["sweep.toml: threshold must be given", "min_precision needs a"]),
+    ],
+)  # fmt: skip
+def test_what_contradicts_itself_is_named_with_its_reason(tmp_path: Path, text: str, words: list[str]) -> None:
+    with pytest.raises(ValueError, match=r"sweep\.toml") as error:
+        _read(tmp_path, f"[grid]\n{text}")
+    for word in words:
+        assert word in str(error.value)
+    assert ("points" in str(error.value)) == ("[" in text)
+
+
+def test_of_many_contradictions_the_first_are_listed_and_all_are_counted() -> None:
+    seeds = {"seed": list(range(50)), "outlier_rate": 0.1}
+    with pytest.raises(ValueError, match=r"^grid 2: 50 of 50 points") as error:
+        expand_grid([seeds, seeds | {"verdict": "adjacency", "min_precision": 0.9}])
+    assert re.findall(r"seed = (\d+): min_precision needs", str(error.value)) == [str(seed) for seed in range(20)]
+    assert str(error.value).endswith("; ...")
+
+
+AXES = {
+    "verdict": VERDICTS,
+    "score": ("auto", "none", *SCORES),
+    "threshold": (None, 0.5),
+    "min_precision": (None, 0.9),
+    "temperature": (1.0, 2.0),
+    "consensus.slope": (0.1, 0.2),
+}
+
+
+@given(st.fixed_dictionaries({name: st.lists(st.sampled_from(some), min_size=1, unique=True)
+                              for name, some in AXES.items()}))  # fmt: skip
+def test_a_grid_is_all_of_its_points_or_an_error_that_names_those_without_sense(axes: dict[str, list[Any]]) -> None:
+    """Against points that are made one by one: none is dropped, none changes what decides."""
+    table = {name: values for name, values in axes.items() if name != "consensus.slope"}
+    table["consensus"] = {"slope": axes["consensus.slope"]}
+    good, bad = [], []
+    for values in itertools.product(*axes.values()):
+        settings = dict(zip(axes, values, strict=True))
+        slope = settings.pop("consensus.slope")
+        try:
+            good.append(TrialConfig(**settings, consensus=ConsensusConfig(slope=slope)))
+        except ValueError as error:
+            bad.append(str(error))
+    if not bad:
+        found = expand_grid([table])
+        assert set(found) == {simplify(trial) for trial in good}
+        assert len(set(found)) == len(found)
+        decided = {(trial.verdict, trial.resolved_score, trial.threshold, trial.min_precision) for trial in good}
+        assert {(trial.verdict, trial.score, trial.threshold, trial.min_precision) for trial in found} == decided
+        return
+    with pytest.raises(ValueError, match=re.escape(bad[0])) as caught:
+        expand_grid([table])
+    message = str(caught.value)
+    assert all(reason in message for reason in bad[:20])
+    assert f"{len(bad)} of {len(bad) + len(good)} points" in message or len(bad) + len(good) == 1

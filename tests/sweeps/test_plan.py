@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tensor_stereo.configs import SweepConfig
+from tensor_stereo.configs import VERDICTS, SweepConfig, TrialConfig
 from tensor_stereo.datasets import PairFiles
 from tensor_stereo.datasets.synthetic import render_pair
 from tensor_stereo.sweeps import Plan, build_plan, expand_grid
@@ -14,7 +14,7 @@ GRID = {
     "detector": ["fast", "gftt"],
     "fast": {"window_px": [9, 11]},
     "constrained": [False, True],
-    "restriction": ["adjacency", "cardinality"],
+    "verdict": ["adjacency", "cardinality"],
     "outlier_rate": [0.0, 0.5],
     "score": "topology",
     "temperature": [0.5, 1.0],
@@ -47,7 +47,19 @@ def test_a_shard_lies_within_its_number(shard: tuple[int, int]) -> None:
         _plan(1).shard(*shard)
 
 
-def test_costs_are_what_a_runner_does(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("config", "graphs", "scores"),
+    [
+        (SweepConfig(expand_grid([GRID])), 4, 8),
+        (SweepConfig(expand_grid([{"verdict": ["score", "adjacency", "cardinality"]}])), 1, 1),
+        (SweepConfig((TrialConfig(verdict="adjacency"), TrialConfig(verdict="cardinality"))), 1, 0),  # auto: no score
+        (SweepConfig(tuple(TrialConfig(verdict=name, score="consensus") for name in VERDICTS)), 1, 1),
+        (SweepConfig(expand_grid([{"score": "consensus", "consensus": {"slope": [0.1, 0.3]}}])), 1, 2),
+    ],
+)
+def test_costs_are_what_a_runner_does(
+    config: SweepConfig, graphs: int, scores: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The runs of each stage that the plan promises, counted while the trials run."""
     import tensor_stereo.trials as trials
 
@@ -64,7 +76,7 @@ def test_costs_are_what_a_runner_does(monkeypatch: pytest.MonkeyPatch) -> None:
             return original(*args, **kwargs)
 
         monkeypatch.setattr(trials, name, count)
-    plan = _plan(1)
+    plan = build_plan(config, [PairFiles("set", "0", Path("a"), Path("b"))])
     pair = render_pair(0)
     for number, row in enumerate(plan.costs().iter_rows(named=True)):
         counted.update(dict.fromkeys(STAGES, 0))
@@ -73,4 +85,4 @@ def test_costs_are_what_a_runner_does(monkeypatch: pytest.MonkeyPatch) -> None:
             runner.run(plan.config.trials[k])
         assert counted == {stage: row[stage] for stage in STAGES}
     assert row["detect"] == row["match"] == 1
-    assert row["graph"] == 4
+    assert (row["graph"], row["score"]) == (graphs, scores)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -13,11 +14,13 @@ import torch
 import tensor_stereo as ts
 from tensor_stereo.cli import main
 from tensor_stereo.configs import SweepConfig
+from tensor_stereo.ops import backends
 from tensor_stereo.sweeps import (
     SweepProgress,
     expand_grid,
     read_config,
     read_errors,
+    read_grid,
     read_matches,
     read_results,
     run_sweep,
@@ -71,21 +74,31 @@ def test_the_manifest_of_a_run_stays(inputs: Inputs, expected: pl.DataFrame, tmp
 
 
 def test_kept_matches_come_back_for_training(inputs: Inputs, tmp_path: Path) -> None:
-    config = SweepConfig(expand_grid([{"detector": "fast", "outlier_rate": [0.0, 0.5]}]), export_matches=True)
+    rates = {"detector": "fast", "outlier_rate": [0.0, 0.5]}
+    tables = [
+        rates | {"verdict": ["adjacency", "cardinality"], "score": ["none", "topology"]},
+        rates | {"verdict": "score", "score": "consensus"},
+    ]
+    config = SweepConfig(expand_grid(tables), export_matches=True)
     out = tmp_path / "run"
     run_sweep(config, inputs.manifest, out, num_workers=1, limit=2)
     rows = read_results(out)
+    assert len(rows) == 2 * (8 + 2)
     for row in rows.iter_rows(named=True):
         found = read_matches(out, row["dataset"], row["scene"], trial=row["trial"])
         assert len(found.inlier) == found.matches.num_matches == row["num_matches"]
-        verdict = ts.classify_matches(found.matches)
-        assert torch.equal(found.inlier, verdict.inlier)
-        assert torch.equal(found.relation, verdict.relation)
+        by_set = ts.classify_matches(found.matches)
+        assert torch.equal(found.relation, by_set.relation)
         assert int((found.inlier & found.correct & found.valid).sum()) == row["true_negative"]
-        assert found.score is not None
-        assert torch.equal(found.score, ts.DelaunayFilter()(found.matches).score)
-    with pytest.raises(ValueError, match="trial 7"):
-        read_matches(out, "synthetic", "synthetic-00", trial=7)
+        if row["score"] == "none":
+            assert found.score is None
+            assert torch.equal(found.inlier, by_set.inlier_of(row["verdict"]))
+        else:
+            expected = ts.DelaunayFilter(verdict=row["verdict"], score=row["score"])(found.matches)
+            assert torch.equal(found.score, expected.score)
+            assert torch.equal(found.inlier, expected.inlier)
+    with pytest.raises(ValueError, match="trial 10"):
+        read_matches(out, "synthetic", "synthetic-00", trial=10)
 
 
 def test_scenes_that_look_like_paths_keep_their_matches_apart(tmp_path: Path) -> None:
@@ -93,7 +106,7 @@ def test_scenes_that_look_like_paths_keep_their_matches_apart(tmp_path: Path) ->
     listed = tmp_path / "pairs" / "ds.csv"
     files = [f"synthetic-0{k}-0.png,synthetic-0{k}-1.png,synthetic-0{k}.pfm" for k in range(2)]
     listed.write_text(f"scene,image0,image1,disparity_gt\nx,{files[0]}\nds/x,{files[1]}\n")
-    config = SweepConfig(expand_grid([{"detector": "fast"}]), export_matches=True)
+    config = SweepConfig(expand_grid([{"detector": "fast", "verdict": "cardinality"}]), export_matches=True)
     run_sweep(config, make_manifest(listed), tmp_path / "run", num_workers=1)
     counts = {row["scene"]: row["num_matches"] for row in read_results(tmp_path / "run").iter_rows(named=True)}
     assert counts.keys() == {"x", "ds/x"}
@@ -107,10 +120,17 @@ def test_a_run_without_matches_says_so(inputs: Inputs, tmp_path: Path) -> None:
         read_matches(tmp_path / "run", "synthetic", "synthetic-00")
 
 
-def test_a_bad_setting_is_told_before_anything_runs(inputs: Inputs, tmp_path: Path) -> None:
-    config = SweepConfig(expand_grid([{"detector": ["gftt", "fast"], "fast": {"window_px": 10}}]))
-    with pytest.raises(ValueError, match=r"point 0 of the grid \(fast\).*window_px"):
-        run_sweep(config, inputs.manifest, tmp_path / "run")
+def test_a_bad_setting_is_told_before_anything_runs(
+    inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ValueError, match="window_px"):
+        expand_grid([{"detector": ["gftt", "fast"], "fast": {"window_px": 10}}])
+    config = SweepConfig(expand_grid([{"detector": ["fast", "gftt"], "verdict": "cardinality"}]))
+    trials = replace(config.trials[0], backend="scipy"), replace(config.trials[1], backend="native")
+    monkeypatch.setattr(backends, "kernels", None)  # what this machine lacks is known when a point runs
+    with pytest.raises(ValueError, match=r"point 1 of the grid \(gftt\): backend 'native'"):
+        run_sweep(SweepConfig(trials), inputs.manifest, tmp_path / "run")
+    monkeypatch.undo()
     assert not (tmp_path / "run").exists()
     with pytest.raises(ValueError, match="limit"):
         run_sweep(inputs.config, inputs.manifest, tmp_path / "run", limit=-1)
@@ -177,8 +197,7 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
     write_manifest(table, tmp_path / "m.parquet")
     (tmp_path / "sweep.toml").write_text("")
     out = tmp_path / "run"
-    config = SweepConfig()
-    run_sweep(config, tmp_path / "m.parquet", out, limit=0)
+    run_sweep(read_grid(tmp_path / "sweep.toml"), tmp_path / "m.parquet", out, limit=0)
     known = json.loads((out / "config.json").read_text())
     with RunStore(out, known, table) as store:
         for unit in range(count):

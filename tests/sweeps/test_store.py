@@ -11,11 +11,11 @@ import pytest
 from tensor_stereo import atomic
 from tensor_stereo.sweeps import RunInUseError, read_errors, read_results
 from tensor_stereo.sweeps.journal import read_journals
-from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
+from tensor_stereo.sweeps.store import FORMAT, METRICS_SCHEMA, RunStore
 from tensor_stereo.sweeps.units import UnitResult
 
 MANIFEST = pl.DataFrame({"scene": ["a", "b"]})
-CONFIG = {"grid": [1, 2], "manifest": {"num_pairs": 2}}
+CONFIG = {"format": FORMAT, "grid": [1, 2], "manifest": {"num_pairs": 2}}
 
 
 def _good(unit: int) -> UnitResult:

@@ -1,0 +1,90 @@
+"""Paths that a call reads and writes, looked at before any work. Imports no torch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def check_source(name: str, path: Path, endings: Sequence[str] = ()) -> Path:
+    """Raise unless a file can be read and has one of some endings, in any case.
+
+    Args:
+        name: Name of the argument, for errors.
+        path: File that must exist.
+        endings: Allowed endings in lower case; none: any.
+
+    Raises:
+        ValueError: for another ending.
+        FileNotFoundError: if there is no such file.
+        PermissionError: if it cannot be read.
+
+    >>> check_source("left", Path("missing.png"))
+    Traceback (most recent call last):
+    ...
+    FileNotFoundError: left: there is no file missing.png
+    """
+    check_ending(name, path, endings)
+    if not path.is_file():
+        raise FileNotFoundError(f"{name}: there is no file {path}")
+    if not os.access(path, os.R_OK):
+        raise PermissionError(f"{name}: {path} cannot be read")
+    return path
+
+
+def check_folder(name: str, path: Path) -> Path:
+    """Raise unless a folder exists.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+    """
+    if not path.is_dir():
+        raise FileNotFoundError(f"{name}: there is no folder {path}")
+    return path
+
+
+def check_ending(name: str, path: Path, endings: Sequence[str]) -> None:
+    """Raise unless a path has one of some endings, in any case.
+
+    Raises:
+        ValueError: naming the endings.
+    """
+    if endings and path.suffix.casefold() not in endings:
+        raise ValueError(f"{name} must end in {' or '.join(endings)}, got {path.name!r}")
+
+
+def prepare_target(name: str, path: Path, endings: Sequence[str] = ()) -> Path:
+    """Make the folder of a file that shall be written, and raise unless the file can be.
+
+    Args:
+        name: Name of the argument, for errors.
+        path: File to write; one that exists may be replaced.
+        endings: Allowed endings in lower case; none: any.
+
+    Raises:
+        ValueError: for another ending, or if the path is a folder.
+        OSError: if the folder cannot be made, or the file not written.
+    """
+    check_ending(name, path, endings)
+    if path.is_dir():
+        raise ValueError(f"{name} must be a file, got the folder {path}")
+    prepare_folder(name, path.parent)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(f"{name}: {path} cannot be written")
+    return path
+
+
+def prepare_folder(name: str, path: Path) -> Path:
+    """Make a folder that shall be written to, and raise unless it can be.
+
+    Raises:
+        OSError: if the folder cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise type(error)(f"{name}: the folder {path} cannot be made: {error.strerror}") from error
+    if not os.access(path, os.W_OK):
+        raise PermissionError(f"{name}: nothing can be written to the folder {path}")
+    return path

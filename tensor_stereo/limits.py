@@ -10,6 +10,10 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 
+class LimitError(ValueError):
+    """A setting lies outside of its limits, whatever the others are."""
+
+
 @dataclass(frozen=True)
 class Within:
     """An interval that a number must lie in; NaN lies in none.
@@ -59,13 +63,13 @@ def check_settings(settings: Any, *, prefix: str = "") -> None:
 
     Raises:
         TypeError: if a value has another type.
-        ValueError: if it has the type but lies outside of the limits.
+        LimitError: if it has the type but lies outside of the limits, a ValueError.
 
     >>> from tensor_stereo.configs import FASTConfig
     >>> FASTConfig(window_px=10)
     Traceback (most recent call last):
     ...
-    ValueError: FASTConfig.window_px must be odd and at least 1, got 10
+    tensor_stereo.limits.LimitError: FASTConfig.window_px must be odd and at least 1, got 10
     """
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():
@@ -90,7 +94,7 @@ def _check(name: str, value: Any, hint: Any) -> None:
         return
     if get_origin(hint) is Literal:
         if value not in get_args(hint):
-            raise ValueError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}, got {value!r}")
+            raise LimitError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}, got {value!r}")
         return
     if get_origin(hint) is tuple:
         _check_type(name, value, tuple)
@@ -104,7 +108,7 @@ def _check(name: str, value: Any, hint: Any) -> None:
         limits = (Within(),)  # a number, not NaN
     for limit in limits:
         if value not in limit:
-            raise ValueError(f"{name} must {limit}, got {value}")
+            raise LimitError(f"{name} must {limit}, got {value}")
 
 
 def _check_type(name: str, value: Any, kind: type) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tensor_stereo.configs import Backend, MatchingConfig, PipelineConfig
 from tensor_stereo.ops import gated_ssd
-from tensor_stereo.ops.gated_ssd import open_gates
+from tensor_stereo.ops._gated_ssd import open_gates
 from tensor_stereo.ops.reference import NONE, pack, unpack
 from tensor_stereo.ops.reference import ssd as ssd_of
 from tensor_stereo.types import Features, Matches
@@ -181,7 +181,7 @@ class _Best:
             self.nearest1.scatter_reduce_(0, index1, pack(cost, index0), "amin")
 
     def take(self, cost: Tensor, index1: Tensor, second_cost: Tensor, cost1: Tensor, index0: Tensor) -> None:
-        """Take over what :func:`tensor_stereo.ops.gated_ssd` has found."""
+        """Take over what :func:`tensor_stereo.ops._gated_ssd` has found."""
         self.nearest = torch.where(index1 < 0, NONE, pack(cost, index1))
         if self.second is not None:
             self.second = torch.where(second_cost.isinf(), NONE, pack(second_cost, torch.zeros_like(index1)))

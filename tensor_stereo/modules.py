@@ -5,24 +5,51 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tensor_stereo.batching import from_padded, lengths_to_ptr
+from tensor_stereo.batching import from_padded, lengths_to_ptr, select_matches
+from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FilterConfig
 from tensor_stereo.features import list_images
-from tensor_stereo.filters import FilterOutput, apply_score, classify_graphs
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores.evidence import ImageEvidence
+from tensor_stereo.scores.by_name import score_matches
+from tensor_stereo.scores.image_evidence import ImageEvidence
 from tensor_stereo.scores.learned import LearnedScore, load_learned
-from tensor_stereo.scores.scoring import score_matches
 from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
 
 Images = Tensor | Sequence[Tensor]
 _RENAMED = {"restriction": "verdict", "unit": "temperature_unit"}
+
+
+@dataclass(frozen=True, eq=False)
+class FilterOutput:
+    """Verdicts and scores in the layout of the input.
+
+    The layout is (B, N) for padded keypoints, (N,) for one pair without batch axis, and (M,) for :class:`Matches`.
+
+    Attributes:
+        inlier: bool; False for untested matches and in the padding.
+        score: in [0, 1], higher is better; 0 for untested matches and in the padding. ``consensus`` and ``learned`` are
+            the calibrated probability of an error of at most 1 px, ``topology`` is a similarity. None if the settings
+            ask for none.
+        relation: int8 values of :class:`Relation`, UNTESTED in the padding.
+        matches: the M real matches of the input, as one ragged batch.
+        mask: bool, the places of ``matches`` in the layout; None for ragged input.
+    """
+
+    inlier: Tensor
+    score: Tensor | None
+    relation: Tensor
+    matches: Matches
+    mask: Tensor | None = None
+
+    def to_matches(self) -> Matches:
+        """The inliers, for the next filter. All pairs stay, some possibly empty; gradients flow to the keypoints."""
+        return select_matches(self.matches, self.inlier if self.mask is None else self.inlier[self.mask])
 
 
 class DelaunayFilter(nn.Module):
@@ -184,7 +211,7 @@ class DelaunayFilter(nn.Module):
             images0: Images of view 0, at which ``learned`` looks: (B, C, H, W), or a list of B images (C, H, W) of any
                 sizes; uint8 or floating point in [0, 1], C = 1 or 3 (RGB). The keypoints are px of these images.
             images1: Images of view 1.
-            evidence: What :func:`tensor_stereo.scores.evidence.measure_images` has measured before for the rows of
+            evidence: What :func:`tensor_stereo.scores.measure_images` has measured before for the rows of
                 ``Matches``, in place of the images.
 
         Returns:

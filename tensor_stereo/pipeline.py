@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
+from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.features import detect_features, to_gray
-from tensor_stereo.filters import apply_score, classify_graphs
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
-from tensor_stereo.scores.scoring import score_matches
+from tensor_stereo.scores.by_name import score_matches
 from tensor_stereo.types import Classification, Features, Matches
 
 ImagePair = tuple[Tensor, Tensor]
@@ -74,7 +74,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         ValueError: if there is no pair, the views of one differ in size, or an image has another layout.
 
     Example:
-        >>> from tensor_stereo.datasets.synthetic import render_pair
+        >>> from tensor_stereo.datasets.synthetic.rendering import render_pair
         >>> pair = render_pair(0)
         >>> output = run_pipeline([(pair.image0, pair.image1)])
         >>> kept = output.classification.inlier

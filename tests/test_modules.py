@@ -12,7 +12,7 @@ import torch
 
 import tensor_stereo as ts
 from tensor_stereo.batching import collate_matches, split_matches, to_padded
-from tests.test_filters import random_pair
+from tests.test_classification import random_pair
 
 NAN = float("nan")
 

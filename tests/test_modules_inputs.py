@@ -13,11 +13,11 @@ from torch import Tensor
 
 import tensor_stereo as ts
 from tensor_stereo.batching import collate_matches, to_padded
-from tensor_stereo.datasets.synthetic import render_pair
+from tensor_stereo.datasets.synthetic.rendering import render_pair
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.pipeline import run_pipeline
 from tensor_stereo.scores.domain import DomainWarning
-from tensor_stereo.scores.evidence import measure_images
+from tensor_stereo.scores.image_evidence import measure_images
 from tests.interop.matchers import scene
 
 SET_TEST = ts.PipelineConfig(verdict="cardinality")

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from tensor_stereo import DelaunayFilter
+from tensor_stereo.classification import classify_graphs
 from tensor_stereo.configs import DETECTORS, Detector, FilterConfig, MatchingConfig, PipelineConfig, Score
 from tensor_stereo.datasets import PairDataset, find_pairs
-from tensor_stereo.datasets.synthetic import SyntheticDataset
-from tensor_stereo.filters import classify_graphs
+from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
 from tensor_stereo.ops import backends
 from tensor_stereo.pipeline import ImagePair, run_pipeline
 from tensor_stereo.types import Relation
@@ -165,7 +165,7 @@ def test_views_of_different_size_are_named() -> None:
 
 
 def test_a_true_disparity_is_kept_more_often_than_a_wrong_one() -> None:
-    from tensor_stereo.metrics import match_rates, matches_against_gt
+    from tensor_stereo.evaluation.metrics import match_rates, matches_against_gt
 
     dataset = list(SyntheticDataset(3))
     output = run_pipeline([(pair.image0, pair.image1) for pair in dataset])

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tensor_stereo import DelaunayFilter
-from tensor_stereo.datasets.synthetic import render_pair
+from tensor_stereo.datasets.synthetic.rendering import render_pair
 
 README = Path(__file__).parents[1] / "README.md"
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, NoReturn
 
 import tyro
@@ -27,13 +30,7 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; bad input ends in one line on standard error and exit code 2."""
     try:
-        command: Any = tyro.cli(
-            Command,
-            prog="tensor-stereo",
-            description="Decide which putative stereo matches are right.",
-            args=arguments,
-            config=(tyro.conf.OmitSubcommandPrefixes,),
-        )
+        command = _parse(arguments)
     except ValueError as error:  # of the settings' own checks; tyro exits by itself
         _fail(error)
     # torch is needed from here on; a sweep that only looks at what is done needs neither reports nor figures
@@ -43,9 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from tensor_stereo.cli.runners import run
     from tensor_stereo.sweeps.journal import SweepError
 
-    _show_domain_warnings_in_one_line()
     try:
-        code = run(command)
+        with _domain_warnings_in_one_line():
+            code = run(command)
     except (ValueError, TypeError, ImportError, SweepError, OSError) as error:
         _fail(error)
     except KeyboardInterrupt:
@@ -55,7 +52,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(code)
 
 
-def _show_domain_warnings_in_one_line() -> None:
+def _parse(arguments: Sequence[str] | None) -> Any:
+    """The command; what tyro wraps of the checks of nested settings is raised as they said it."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                Command,
+                prog="tensor-stereo",
+                description="Decide which putative stereo matches are right.",
+                args=arguments,
+                config=(tyro.conf.OmitSubcommandPrefixes,),
+            )
+    except SystemExit:
+        text = " ".join(line.strip("│╭╮╰╯─ ") for line in said.getvalue().splitlines())
+        wrapped = re.search(r"Error parsing \S+: (\w+Config\..+?, got \S+)", text)
+        if wrapped:
+            raise ValueError(wrapped[1]) from None
+        print(said.getvalue(), end="", file=sys.stderr)
+        raise
+
+
+@contextlib.contextmanager
+def _domain_warnings_in_one_line() -> Iterator[None]:
     """Say once of each kind, as errors are said, that a score is used outside of its domain."""
     show, seen = warnings.showwarning, set()
 
@@ -68,7 +87,11 @@ def _show_domain_warnings_in_one_line() -> None:
             seen.add(kind)
             print(f"tensor-stereo: warning: {message}", file=sys.stderr)
 
-    warnings.showwarning = show_line
+    warnings.showwarning = show_line  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
 
 
 def _fail(error: Exception) -> NoReturn:

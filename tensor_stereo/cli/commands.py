@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from tensor_stereo.configs import EvaluationConfig, FileFilterConfig, PipelineConfig
-from tensor_stereo.datasets.releases import RELEASES
+from tensor_stereo.datasets.download.releases import RELEASES
 
 Flat = tyro.conf.arg(name="")
 

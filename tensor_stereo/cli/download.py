@@ -11,8 +11,8 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from tensor_stereo.cli.commands import Download
 from tensor_stereo.datasets import find_pairs
-from tensor_stereo.datasets.download import DownloadProgress, download_releases
-from tensor_stereo.datasets.releases import RELEASES
+from tensor_stereo.datasets.download.fetch import DownloadProgress, download_releases
+from tensor_stereo.datasets.download.releases import RELEASES
 
 Show = Callable[[DownloadProgress], None]
 

@@ -15,11 +15,11 @@ from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filte
 from tensor_stereo.cli.download import run_download_command
 from tensor_stereo.configs import EvaluationConfig
 from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
-from tensor_stereo.datasets.synthetic import SyntheticDataset, write_synthetic
-from tensor_stereo.evaluation import PairEvaluation, evaluate_dataset
+from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset, write_synthetic
+from tensor_stereo.evaluation.dataset import PairEvaluation, evaluate_dataset
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.reports.evaluation import write_evaluation
-from tensor_stereo.reports.matches import classify_files
+from tensor_stereo.reports.pair import classify_files
 from tensor_stereo.reports.sweep.report import write_report
 from tensor_stereo.reports.sweep.runs import load_run
 from tensor_stereo.reports.tables import Table, to_markdown

@@ -15,11 +15,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tensor_stereo.cli.commands import Sweep
 from tensor_stereo.datasets import read_manifest
+from tensor_stereo.evaluation.trials import STAGES
 from tensor_stereo.sweeps import SweepProgress, build_plan, read_grid, run_sweep
 from tensor_stereo.sweeps.plan import Plan
 from tensor_stereo.sweeps.run import check_trials
 from tensor_stereo.sweeps.units import run_tasks
-from tensor_stereo.trials import STAGES
 
 SOME_FAILED, INTERRUPTED = 1, 130
 _PLAIN_SECONDS = 10.0  # between lines where the output is no terminal

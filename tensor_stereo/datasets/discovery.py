@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from .eth3d import eth3d_pairs
-from .files import PairFiles, StrPath, check_gt_scale, collect_pairs, missing_scale
-from .kitti import kitti_pairs
-from .middlebury import middlebury_pairs
-from .sceneflow import sceneflow_pairs
-from .sintel import sintel_pairs
+from tensor_stereo.datasets.eth3d import eth3d_pairs
+from tensor_stereo.datasets.files import PairFiles, StrPath, check_gt_scale, collect_pairs, missing_scale
+from tensor_stereo.datasets.kitti import kitti_pairs
+from tensor_stereo.datasets.middlebury import middlebury_pairs
+from tensor_stereo.datasets.sceneflow import sceneflow_pairs
+from tensor_stereo.datasets.sintel import sintel_pairs
 
 _EXPECTED = """\
   Middlebury 2001, 2003:     SCENE/im2, im6, disp2 (png, ppm or pgm)

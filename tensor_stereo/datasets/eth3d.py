@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from .files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
 
 _FOLDER = re.compile(
     r"eth3d(?:[-_ ]?(?:stereo|low[-_]?res|two[-_]?view))*|two_view_(?:training|test|testing)", re.IGNORECASE

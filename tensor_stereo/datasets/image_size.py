@@ -6,7 +6,7 @@ import re
 import struct
 from pathlib import Path
 
-from .files import StrPath
+from tensor_stereo.datasets.files import StrPath
 
 _PNG_START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # W3C PNG, sections 5.2 and 11.2.1: IHDR comes first
 _PNM_HEADER = re.compile(rb"P[1-6](?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})\s")

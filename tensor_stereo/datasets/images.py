@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .files import StrPath, check_gt_scale
+from tensor_stereo.datasets.files import StrPath, check_gt_scale
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from .files import PairFiles, StrPath, collect_pairs, parent_names
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, parent_names
 
 _SCALE = 256.0  # of the 16-bit maps, in both releases
 

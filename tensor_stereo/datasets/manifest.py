@@ -10,10 +10,9 @@ from pathlib import Path
 import polars as pl
 
 from tensor_stereo.atomic import whole_file
-
-from .discovery import find_pairs
-from .files import GT_ENCODINGS, PairFiles, StrPath, check_gt_scale
-from .image_size import image_size
+from tensor_stereo.datasets.discovery import find_pairs
+from tensor_stereo.datasets.files import GT_ENCODINGS, PairFiles, StrPath, check_gt_scale
+from tensor_stereo.datasets.image_size import image_size
 
 _PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration")
 SCHEMA = {

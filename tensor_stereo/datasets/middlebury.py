@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .eth3d import is_eth3d_scene
-from .files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
-from .image_size import image_size
-from .middlebury_scales import find_release, folder_year, integer_scale
+from tensor_stereo.datasets.eth3d import is_eth3d_scene
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
+from tensor_stereo.datasets.image_size import image_size
+from tensor_stereo.datasets.middlebury_scales import find_release, folder_year, integer_scale
 
 _MIDDEVAL3 = re.compile(r"middeval3|(?:training|test)[FHQ]", re.IGNORECASE)
 _SCENES_2014 = re.compile(r".+-(?:im)?perfect", re.IGNORECASE)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .files import parent_names
+from tensor_stereo.datasets.files import parent_names
 
 _SCENES = {
     "2001": "barn1 barn2 bull map poster sawtooth tsukuba venus",

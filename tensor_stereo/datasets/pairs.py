@@ -13,17 +13,16 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from tensor_stereo.types import StereoPair
-
-from .files import PairFiles, check_gt_scale, missing_scale
-from .images import (
+from tensor_stereo.datasets.files import PairFiles, check_gt_scale, missing_scale
+from tensor_stereo.datasets.images import (
     read_disparity_png,
     read_image,
     read_occlusion_mask,
     read_sintel_disparity,
     read_sintel_occlusion,
 )
-from .pfm import FloatMap, read_pfm
+from tensor_stereo.datasets.pfm import FloatMap, read_pfm
+from tensor_stereo.types import StereoPair
 
 
 def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import StrPath
+from tensor_stereo.datasets.files import StrPath
 
 FloatMap: TypeAlias = NDArray[np.float32]
 

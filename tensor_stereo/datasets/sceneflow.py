@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .files import PairFiles, StrPath, collect_pairs, parent_names
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, parent_names
 
 _PASSES = ("cleanpass", "finalpass")
 _NAMES = ("flyingthings3d", "monkaa", "driving")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .files import PairFiles, StrPath, collect_pairs
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs
 
 _PASSES = ("clean", "final")
 

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.configs import UNRECTIFIED, ConsensusConfig
-from tensor_stereo.filters import FilterOutput
-from tensor_stereo.modules import DelaunayFilter
+from tensor_stereo.modules import DelaunayFilter, FilterOutput
 from tensor_stereo.types import Matches, check_tensor, check_vector
 
 _ENTRIES = (

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import batch_to_ptr
-from tensor_stereo.filters import FilterOutput
 from tensor_stereo.interop.glue_factory import from_glue_factory, to_glue_factory, two_view_filter
-from tensor_stereo.modules import Images
+from tensor_stereo.modules import FilterOutput, Images
 from tensor_stereo.types import Matches, check_integer, check_tensor, check_vector
 
 _ROWS = ("keypoints0", "keypoints1", "confidence", "batch_indexes")  # what LoFTR returns, one row per match

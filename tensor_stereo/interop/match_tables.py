@@ -24,6 +24,7 @@ from tensor_stereo.interop.verdicts import (
 from tensor_stereo.types import Matches, Relation
 
 _POINTS = ("x0", "y0", "x1", "y1")
+_RESULTS = ("score", "probability", "inlier_adjacency", "inlier_cardinality", "inlier_score")
 # Polars would inflate such a file, whatever its ending says, and to any size: gzip, zlib, Zstandard.
 _COMPRESSED = (b"\x1f\x8b", b"x\x01", b"x\x9c", b"x\xda", b"\x28\xb5\x2f\xfd")
 # Prints the number of rows that the file claims, then decodes it all.
@@ -52,8 +53,8 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     verdicts = filter_matches(_to_matches(source, table, pair, order), run)
     verdicts = verdicts.take(np.argsort(order, kind="stable"))
     names = {relation.value: relation.name.lower() for relation in Relation}
-    if verdicts.score is None:
-        table = table.drop("score", strict=False)  # of an earlier filter
+    earlier = [name for name in table.columns if name in _RESULTS]  # of classify or of another filter
+    table = table.drop(name for name in earlier if name != "score" or verdicts.score is None)
     table = table.with_columns(
         pl.Series("inlier", verdicts.inlier),
         *([] if verdicts.score is None else [pl.Series("score", verdicts.score)]),

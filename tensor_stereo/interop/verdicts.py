@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from tensor_stereo.batching import collate_matches, select_pairs
-from tensor_stereo.filters import FilterOutput
+from tensor_stereo.modules import FilterOutput
 from tensor_stereo.ops.segments import LARGEST, SMALLEST
 from tensor_stereo.types import Matches, Relation
 

@@ -1,19 +1,19 @@
 """Operators of ``torch.library`` under the namespace ``tensor_stereo``, each with a slow reference."""
 
+from tensor_stereo.ops._consensus_belief import consensus_belief as consensus_belief
+from tensor_stereo.ops._delaunay_graph import delaunay_graph as delaunay_graph
+from tensor_stereo.ops._delaunay_graph import match_graphs as match_graphs
+from tensor_stereo.ops._dual_critical_points import dual_critical_points as dual_critical_points
+from tensor_stereo.ops._dual_edge_ratio import dual_edge_ratio as dual_edge_ratio
+from tensor_stereo.ops._dual_edge_ratio import dual_edge_ratio_backward as dual_edge_ratio_backward
+from tensor_stereo.ops._gated_ssd import gated_ssd as gated_ssd
+from tensor_stereo.ops._predicates import incircle as incircle
+from tensor_stereo.ops._predicates import orientation as orientation
+from tensor_stereo.ops._relate import relate as relate
+from tensor_stereo.ops._row_overlap import row_overlap as row_overlap
+from tensor_stereo.ops._soft_counts import soft_counts as soft_counts
+from tensor_stereo.ops._soft_counts import soft_counts_backward as soft_counts_backward
+from tensor_stereo.ops._soft_match_graphs import soft_match_graphs as soft_match_graphs
 from tensor_stereo.ops.backends import BackendInfo as BackendInfo
 from tensor_stereo.ops.backends import backend as backend
 from tensor_stereo.ops.backends import resolve_backend as resolve_backend
-from tensor_stereo.ops.consensus_belief import consensus_belief as consensus_belief
-from tensor_stereo.ops.delaunay_graph import delaunay_graph as delaunay_graph
-from tensor_stereo.ops.delaunay_graph import match_graphs as match_graphs
-from tensor_stereo.ops.dual_critical_points import dual_critical_points as dual_critical_points
-from tensor_stereo.ops.dual_edge_ratio import dual_edge_ratio as dual_edge_ratio
-from tensor_stereo.ops.dual_edge_ratio import dual_edge_ratio_backward as dual_edge_ratio_backward
-from tensor_stereo.ops.gated_ssd import gated_ssd as gated_ssd
-from tensor_stereo.ops.predicates import incircle as incircle
-from tensor_stereo.ops.predicates import orientation as orientation
-from tensor_stereo.ops.relate import relate as relate
-from tensor_stereo.ops.row_overlap import row_overlap as row_overlap
-from tensor_stereo.ops.soft_counts import soft_counts as soft_counts
-from tensor_stereo.ops.soft_counts import soft_counts_backward as soft_counts_backward
-from tensor_stereo.ops.soft_match_graphs import soft_match_graphs as soft_match_graphs

@@ -21,7 +21,7 @@ _MAX_COORDINATE_PX = 2**24
 
 
 def row_overlap(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Row sums of A0 AND A1, and of A0 and A1; see :func:`tensor_stereo.ops.row_overlap`.
+    """Row sums of A0 AND A1, and of A0 and A1; see :func:`tensor_stereo.ops._row_overlap`.
 
     torch has no arithmetic on sparse boolean tensors; the AND is a merge of the sorted keys row * M + column.
 
@@ -45,7 +45,7 @@ def row_overlap(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor) -> t
 def relate(
     overlap: Tensor, degree0: Tensor, degree1: Tensor, group_size: Tensor, min_group_size: int, accept_subsets: bool
 ) -> tuple[Tensor, Tensor]:
-    """Relation and verdict from the sizes of neighbour sets; see :func:`tensor_stereo.ops.relate`."""
+    """Relation and verdict from the sizes of neighbour sets; see :func:`tensor_stereo.ops._relate`."""
     within0, within1 = overlap == degree0, overlap == degree1
     relation = torch.full_like(overlap, Relation.CONFLICT, dtype=torch.int8)
     relation[within0] = int(Relation.SUBSET)
@@ -59,7 +59,7 @@ def relate(
 
 
 def gated_ssd(features0: Features, features1: Features, config: MatchingConfig) -> tuple[Tensor, ...]:
-    """Nearest neighbours inside the gates; see :func:`tensor_stereo.ops.gated_ssd` for the five results.
+    """Nearest neighbours inside the gates; see :func:`tensor_stereo.ops._gated_ssd` for the five results.
 
     Example:
         >>> ptr = torch.tensor([0, 2])
@@ -232,7 +232,7 @@ def _blocks(counts: Tensor) -> Iterator[tuple[int, int]]:
 
 
 def dual_edge_ratio(points: Tensor, pairs: Tensor, critical: Tensor, bound: float) -> Tensor:
-    """Signed lengths of dual Voronoi edges, with autograd; see :func:`tensor_stereo.ops.dual_edge_ratio`."""
+    """Signed lengths of dual Voronoi edges, with autograd; see :func:`tensor_stereo.ops._dual_edge_ratio`."""
     ends = []
     for k in critical.unbind(1):
         along, across, is_free = _dual_end(points, pairs, k, bound)

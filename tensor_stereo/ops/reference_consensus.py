@@ -57,7 +57,7 @@ def consensus_belief(
     cost_weight: float,
     num_rounds: int,
 ) -> Tensor:
-    """Beliefs in matches after some rounds, with autograd; see :func:`tensor_stereo.ops.consensus_belief`.
+    """Beliefs in matches after some rounds, with autograd; see :func:`tensor_stereo.ops._consensus_belief`.
 
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])

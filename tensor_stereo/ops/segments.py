@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tensor_stereo.duplicates import coincident_ids, keep_one_to_one
+from tensor_stereo.delaunay.one_to_one import coincident_ids, keep_one_to_one
 from tensor_stereo.types import check_integer, check_points, check_ptr, check_vector
 
 Float = NDArray[np.float64]

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from tensor_stereo.configs import EvaluationConfig, describe_settings
-from tensor_stereo.evaluation import PairEvaluation
+from tensor_stereo.evaluation.dataset import PairEvaluation
+from tensor_stereo.evaluation.metrics import IsolatedCounts
 from tensor_stereo.features import to_gray
-from tensor_stereo.metrics import IsolatedCounts
 from tensor_stereo.objects import trace_objects
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.reports.tables import Table, paper_tables, to_markdown
@@ -33,7 +33,7 @@ def write_evaluation(
     """Consume an evaluation and make the paper's tables of it.
 
     Args:
-        results: as :func:`tensor_stereo.evaluation.evaluate_dataset` yields them.
+        results: as :func:`tensor_stereo.evaluation.dataset.evaluate_dataset` yields them.
         config: the settings that they were made with.
         source: what was evaluated, for settings.json.
         out: folder for summary.json, settings.json, tables.md and figures/; None writes nothing.

@@ -109,6 +109,8 @@ def draw_classification(
             raise ValueError(f"{name} must have {matches.num_matches} nodes, one per match, got {adjacency.num_nodes}")
     if not verdicts:
         raise ValueError("verdicts must hold at least one")
+    for name, inlier in verdicts.items():
+        check_vector(f"verdicts[{name!r}]", inlier, matches.num_matches)
     rows = [_classes(inlier, tested, correct, valid, matches.num_matches) for inlier in verdicts.values()]
     keypoints = [points.numpy(force=True) for points in (matches.keypoints0, matches.keypoints1)]
     edges = [_edges(adjacency0), _edges(adjacency1)]
@@ -275,7 +277,6 @@ def _classes(
 ) -> list[_Class]:
     """How the matches are told apart, the errors that matter most first."""
     if correct is None and valid is None:
-        check_vector("verdicts", inlier, num_matches)
         kept: NDArray[np.bool_] = inlier.numpy(force=True)
         known: NDArray[np.bool_] = np.ones(num_matches, np.bool_)
         if tested is not None:

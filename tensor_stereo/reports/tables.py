@@ -57,7 +57,7 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
 
     Args:
         rows: one record per scene, detector, variant and verdict, as
-            :func:`tensor_stereo.evaluation.score_dataset` documents them; None in place of a number means NaN.
+            :func:`tensor_stereo.evaluation.dataset.score_dataset` documents them; None in place of a number means NaN.
         restriction: The one of the paper whose records are shown, beside those of the score.
 
     Returns:

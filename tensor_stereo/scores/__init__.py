@@ -1,1 +1,37 @@
-"""Scores of putative matches beside the paper's verdict: consensus without weights, and a learned one."""
+"""Scores of putative matches: a learned probability, consensus without weights, and the topology of both graphs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tensor_stereo.lazy import attach
+
+if TYPE_CHECKING:
+    from tensor_stereo.scores.by_name import score_matches as score_matches
+    from tensor_stereo.scores.calibration import calibrate_consensus as calibrate_consensus
+    from tensor_stereo.scores.calibration import keep_by_target as keep_by_target
+    from tensor_stereo.scores.consensus import consensus_belief as consensus_belief
+    from tensor_stereo.scores.consensus import consensus_score as consensus_score
+    from tensor_stereo.scores.domain import DomainWarning as DomainWarning
+    from tensor_stereo.scores.image_evidence import ImageEvidence as ImageEvidence
+    from tensor_stereo.scores.image_evidence import measure_images as measure_images
+    from tensor_stereo.scores.learned import LearnedScore as LearnedScore
+    from tensor_stereo.scores.learned import load_learned as load_learned
+    from tensor_stereo.scores.learned import score_learned as score_learned
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "DomainWarning": "domain",
+        "ImageEvidence": "image_evidence",
+        "LearnedScore": "learned",
+        "calibrate_consensus": "calibration",
+        "consensus_belief": "consensus",
+        "consensus_score": "consensus",
+        "keep_by_target": "calibration",
+        "load_learned": "learned",
+        "measure_images": "image_evidence",
+        "score_learned": "learned",
+        "score_matches": "by_name",
+    },
+)

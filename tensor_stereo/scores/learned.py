@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.scores.evidence import NUM_VALUES, ImageEvidence
-from tensor_stereo.scores.quantities import (
+from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
+from tensor_stereo.scores.learned_inputs import (
     NUM_COST,
     NUM_EDGE,
     NUM_EDGE_IMAGE,

@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
-from .grid import expand_grid as expand_grid
-from .grid import read_grid as read_grid
-from .journal import RunInUseError as RunInUseError
-from .journal import SweepError as SweepError
-from .plan import Plan as Plan
-from .plan import build_plan as build_plan
-from .results import read_config as read_config
-from .results import read_errors as read_errors
-from .results import read_matches as read_matches
-from .results import read_results as read_results
-from .run import SweepProgress as SweepProgress
-from .run import SweepSummary as SweepSummary
-from .run import run_sweep as run_sweep
+from typing import TYPE_CHECKING
+
+from tensor_stereo.lazy import attach
+
+if TYPE_CHECKING:
+    from tensor_stereo.sweeps.grid import expand_grid as expand_grid
+    from tensor_stereo.sweeps.grid import read_grid as read_grid
+    from tensor_stereo.sweeps.journal import RunInUseError as RunInUseError
+    from tensor_stereo.sweeps.journal import SweepError as SweepError
+    from tensor_stereo.sweeps.plan import Plan as Plan
+    from tensor_stereo.sweeps.plan import build_plan as build_plan
+    from tensor_stereo.sweeps.results import StoredMatches as StoredMatches
+    from tensor_stereo.sweeps.results import read_config as read_config
+    from tensor_stereo.sweeps.results import read_errors as read_errors
+    from tensor_stereo.sweeps.results import read_matches as read_matches
+    from tensor_stereo.sweeps.results import read_results as read_results
+    from tensor_stereo.sweeps.run import SweepProgress as SweepProgress
+    from tensor_stereo.sweeps.run import SweepSummary as SweepSummary
+    from tensor_stereo.sweeps.run import run_sweep as run_sweep
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "Plan": "plan",
+        "RunInUseError": "journal",
+        "StoredMatches": "results",
+        "SweepError": "journal",
+        "SweepProgress": "run",
+        "SweepSummary": "run",
+        "build_plan": "plan",
+        "expand_grid": "grid",
+        "read_config": "results",
+        "read_errors": "results",
+        "read_grid": "grid",
+        "read_matches": "results",
+        "read_results": "results",
+        "run_sweep": "run",
+    },
+)

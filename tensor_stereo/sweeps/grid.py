@@ -12,6 +12,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from tensor_stereo.configs import DETECTORS, ObjectsConfig, SweepConfig, TrialConfig
+from tensor_stereo.limits import LimitError
 
 _DEFAULT = TrialConfig()
 _TOP = ("grid", "export_matches")
@@ -107,6 +108,8 @@ def _expand(axes: Sequence[tuple[tuple[str, ...], list[Any]]]) -> list[TrialConf
             place[names[-1]] = value
         try:
             trials.append(_make(_DEFAULT, settings))
+        except LimitError:  # no matter of the other settings
+            raise
         except ValueError as error:
             varying = [(names, v) for (names, some), v in zip(axes, values, strict=True) if len(some) > 1]
             point = ", ".join(f"{'.'.join(names)} = {'none' if value is None else value}" for names, value in varying)

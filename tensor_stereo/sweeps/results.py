@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.configs import SweepConfig
+from tensor_stereo.evaluation.trials import setting_columns
 from tensor_stereo.sweeps.grid import expand_grid
 from tensor_stereo.sweeps.journal import read_journals
 from tensor_stereo.sweeps.store import MATCHES_SCHEMA, METRICS_SCHEMA, errors_table, read_config_file
@@ -40,11 +41,19 @@ class StoredMatches:
 def read_results(run: Path | str) -> pl.DataFrame:
     """One row per finished unit and trial, in this order, with the columns of ``METRICS_SCHEMA``.
 
+    The columns of the settings come from the configuration of the run, so that they are the same for parts that an
+    earlier release wrote without some of them.
+
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
         ValueError: if it has a format that this release does not read.
     """
-    return _read_parts(run, "metrics", METRICS_SCHEMA).collect().sort("unit", "trial")
+    table = _read_parts(run, "metrics", METRICS_SCHEMA).collect().sort("unit", "trial")
+    settings = [setting_columns(trial) for trial in read_config(run).trials]
+    names = settings[0].keys()
+    known = pl.DataFrame(settings, schema={name: METRICS_SCHEMA[name] for name in names})
+    known = known.with_row_index("trial").cast({"trial": METRICS_SCHEMA["trial"]})
+    return table.drop(names).join(known, on="trial", how="left", maintain_order="left").select(list(METRICS_SCHEMA))
 
 
 def read_config(run: Path | str) -> SweepConfig:

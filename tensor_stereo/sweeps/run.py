@@ -14,7 +14,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -24,13 +24,14 @@ import torch
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import read_manifest
+from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.sweeps.engines import Engine, LocalEngine, Outcome
+from tensor_stereo.sweeps.grid import simplify
 from tensor_stereo.sweeps.log import log_to_file
 from tensor_stereo.sweeps.plan import Plan, Task, build_plan
 from tensor_stereo.sweeps.ray_engine import RayEngine
 from tensor_stereo.sweeps.store import FORMAT, RunStore, append_environment
 from tensor_stereo.sweeps.units import failed_unit
-from tensor_stereo.trials import TrialRunner
 from tensor_stereo.types import StereoPair
 
 EngineName = Literal["local", "ray"]
@@ -136,6 +137,7 @@ def run_sweep(
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
     if engine not in ("local", "ray"):
         raise ValueError(f"engine must be 'local' or 'ray', got {engine!r}")
+    config = replace(config, trials=tuple(simplify(trial) for trial in config.trials))
     plan = build_plan(config, read_manifest(manifest, check_files=False))
     units = plan.shard(*shard)
     if not (out / "config.json").exists():

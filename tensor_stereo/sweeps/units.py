@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import PairFiles, read_pair
+from tensor_stereo.evaluation.trials import Trial, TrialRunner
 from tensor_stereo.sweeps.plan import Task
-from tensor_stereo.trials import Trial, TrialRunner
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import tensor_stereo as ts
 from tensor_stereo.cli import main
 from tensor_stereo.configs import RESTRICTIONS, VERDICTS
 from tensor_stereo.datasets import read_image
-from tensor_stereo.datasets.synthetic import render_pair
+from tensor_stereo.datasets.synthetic.rendering import render_pair
 from tests.cli.failing import fails
 
 
@@ -71,12 +71,12 @@ def test_classify_writes_every_match(scene: Path, tmp_path: Path, ending: str, c
     printed = _printed(capsys)
     assert int(printed["num_matches"]) == table.height > 100
     assert int(printed["num_kept"]) == table["inlier"].sum()
-    assert int(printed["num_untested"]) == (table["relation"] == "UNTESTED").sum() > 0
+    assert int(printed["num_untested"]) == (table["relation"] == "untested").sum() > 0
     assert sum(int(printed[f"num_{name}"]) for name in ("kept", "rejected", "untested")) == table.height
     for name in VERDICTS:
         assert int(printed[f"kept_by_{name}"]) == table[f"inlier_{name}"].sum() > 0
     assert table["inlier"].equals(table["inlier_score"])
-    assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "UNTESTED"))
+    assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "untested"))
     assert {"sensitivity", "specificity"} <= printed.keys()
     assert {"group", "correct"} <= set(table.columns)
     assert "score" not in table.columns
@@ -100,7 +100,9 @@ def test_the_verdicts_of_the_paper_are_those_of_classify_matches(
             expected = ts.classify_matches(matches, restriction=name, min_group_size=5)
             assert table[f"inlier_{name}"].to_list() == expected.inlier.tolist()
             assert 0 < expected.inlier.sum() < len(table)
-            assert table["relation"].to_list() == [ts.Relation(value).name for value in expected.relation.tolist()]
+            assert table["relation"].to_list() == [
+                ts.Relation(value).name.lower() for value in expected.relation.tolist()
+            ]
             if settings == ["--verdict", name]:
                 assert table["inlier"].equals(table[f"inlier_{name}"])
         assert table["inlier_adjacency"].sum() < table["inlier_cardinality"].sum()
@@ -123,7 +125,7 @@ def test_a_verdict_of_the_paper_pays_for_no_score_and_shows_one_that_is_asked_fo
     table, printed = pl.read_parquet(out), _printed(capsys)
     assert table.select(plain.columns).equals(plain)
     assert set(table.columns) - set(plain.columns) == {"probability", "inlier_score"}
-    assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "UNTESTED"))
+    assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "untested"))
     assert int(printed["kept_by_score"]) == table["inlier_score"].sum() != int(printed["num_kept"])
     main([*command, "--score", "topology"])  # no probability, so it decides nothing
     table, printed = pl.read_parquet(out), _printed(capsys)
@@ -272,7 +274,7 @@ def test_the_score_can_decide(scene: Path, tmp_path: Path, score: str) -> None:
     out, images = tmp_path / "matches.parquet", [str(scene / "im0.png"), str(scene / "im1.png")]
     main(["classify", *images, "--out", str(out), "--score", score, "--threshold", "0.4"])
     table = pl.read_parquet(out)
-    tested = table["relation"] != "UNTESTED"
+    tested = table["relation"] != "untested"
     column = "score" if score == "topology" else "probability"
     assert table["inlier"].equals((table[column] >= 0.4) & tested)
     assert table["inlier_score"].equals(table["inlier"])

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from tensor_stereo.datasets import disk_space
-from tensor_stereo.datasets.archives import is_archive, unpack_archive
+from tensor_stereo.datasets.download import disk_space
+from tensor_stereo.datasets.download.archives import is_archive, unpack_archive
 
 FILES = {"Art/view1.png": b"left", "Art/disp1.png": b"truth" * 1000, "Books/view1.png": b""}
 

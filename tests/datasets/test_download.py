@@ -18,10 +18,12 @@ import numpy as np
 import pooch
 import pytest
 
-from tensor_stereo.datasets import download, find_pairs, transfer
-from tensor_stereo.datasets.archives import is_archive
-from tensor_stereo.datasets.download import DownloadProgress, download_releases
-from tensor_stereo.datasets.releases import RELEASES, Release, RemoteFile
+from tensor_stereo.datasets import find_pairs
+from tensor_stereo.datasets.download import fetch as fetching
+from tensor_stereo.datasets.download import transfer
+from tensor_stereo.datasets.download.archives import is_archive
+from tensor_stereo.datasets.download.fetch import DownloadProgress, download_releases
+from tensor_stereo.datasets.download.releases import RELEASES, Release, RemoteFile
 from tests.datasets.file_server import Site, serve
 
 ART = "/stereo/data/scenes2005/ThirdSize/zip-2views/Art-2views.zip"
@@ -386,11 +388,11 @@ def test_the_table_names_every_file_once_and_over_https():
 
 def test_the_module_imports_no_heavy_library():
     code = (
-        "import sys, tensor_stereo.datasets.download;"
+        "import sys, tensor_stereo.datasets.download.fetch;"
         "print(sorted({'torch', 'pooch', 'requests', 'py7zr', 'polars'} & sys.modules.keys()))"
     )
     path = os.pathsep.join(filter(None, sys.path))
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": path})
     assert result.stdout.strip() == "[]"
-    assert download.LOCK_NAME == "checksums.json"
+    assert fetching.LOCK_NAME == "checksums.json"

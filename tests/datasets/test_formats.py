@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from tensor_stereo.datasets.calibration import Calibration, read_calibration
+from tensor_stereo.datasets.camera import Calibration, read_calibration
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.datasets.images import read_disparity_png, read_image, read_occlusion_mask
 from tensor_stereo.datasets.pfm import read_pfm, write_pfm

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from tensor_stereo.configs import SyntheticConfig
-from tensor_stereo.datasets.scenes import build_scene
-from tensor_stereo.datasets.surfaces import Camera, Patch, Scene
-from tensor_stereo.datasets.synthetic import Rendering, SyntheticDataset, render_pair, render_scene
-from tensor_stereo.datasets.textures import Texture
+from tensor_stereo.datasets.synthetic.rendering import Rendering, SyntheticDataset, render_pair, render_scene
+from tensor_stereo.datasets.synthetic.scenes import build_scene
+from tensor_stereo.datasets.synthetic.surfaces import Camera, Patch, Scene
+from tensor_stereo.datasets.synthetic.textures import Texture
 
 SMALL = SyntheticConfig(width_px=160, height_px=120, max_disparity_px=24)
 KINDS = range(4)
@@ -128,7 +128,9 @@ def test_a_board_hides_what_two_rulers_say(monkeypatch: pytest.MonkeyPatch) -> N
         return Patch(camera.point(13.1, 2.5, disparity), axes, half_size, Texture(np.full((1, 1), level), 1.0))
 
     board, wall = facing(4.2, (3 / 4.2, 9.0), 200.0), facing(4.0, None, 100.0)
-    monkeypatch.setattr("tensor_stereo.datasets.synthetic.build_scene", lambda *_: Scene(camera, [board, wall]))
+    monkeypatch.setattr(
+        "tensor_stereo.datasets.synthetic.rendering.build_scene", lambda *_: Scene(camera, [board, wall])
+    )
     rendering = render_scene(0, SyntheticConfig(width_px=24, height_px=6, samples_per_px=2))
     columns = np.arange(24)
     for disparity, first, last in ((rendering.disparity0, 11, 16), (rendering.disparity1, 6, 11)):

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from tensor_stereo.datasets import disk_space, transfer
-from tensor_stereo.datasets.transfer import discard_part, fetch_part
+from tensor_stereo.datasets.download import disk_space, transfer
+from tensor_stereo.datasets.download.transfer import discard_part, fetch_part
 from tests.datasets.file_server import Site, serve
 
 CONTENT = bytes(range(256)) * 4000  # several blocks

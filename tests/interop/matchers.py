@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo import Matches
-from tensor_stereo.filters import FilterOutput
 from tensor_stereo.interop.glue_factory import two_view_filter
+from tensor_stereo.modules import FilterOutput
 
 
 def scene(seed: int, n: int = 60, wrong: float = 0.3) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from tensor_stereo import DelaunayFilter, Matches, filter_disparity
-from tensor_stereo.datasets.synthetic import render_pair
+from tensor_stereo.datasets.synthetic.rendering import render_pair
+from tensor_stereo.evaluation.metrics import roc_auc
 from tensor_stereo.interop.glue_factory import GlueFactoryFilter, two_view_filter
 from tensor_stereo.interop.kornia import (
     FilteredMatcher,
@@ -18,7 +19,6 @@ from tensor_stereo.interop.kornia import (
     to_lightglue,
     to_loftr,
 )
-from tensor_stereo.metrics import roc_auc
 from tests.interop.test_glue_factory import predictions
 
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from tensor_stereo import Matches
 from tensor_stereo.batching import collate_matches, split_matches
-from tensor_stereo.filters import FilterOutput
 from tensor_stereo.interop import verdicts
 from tensor_stereo.interop.glue_factory import from_glue_factory, two_view_filter
 from tensor_stereo.interop.verdicts import FilterSummary, Verdicts, filter_each, filter_matches, pick_matches
+from tensor_stereo.modules import FilterOutput
 from tests.interop.match_batches import batch, expected_of_any_views
 
 sizes = st.lists(st.integers(0, 30), max_size=8)

@@ -11,7 +11,7 @@ from tensor_stereo.ops import delaunay_graph, match_graphs
 from tensor_stereo.types import Matches
 from tests.oracles import circle_graph, edge_set, installed_backends
 from tests.point_sets import GENERATORS, distinct_points
-from tests.test_filters import random_pair
+from tests.test_classification import random_pair
 
 needs_kernels = pytest.mark.skipif("native" not in installed_backends(), reason="the native kernels are not installed")
 TOLERANCES = (0.0, 1e-12, 1e-6, 1e-3, 0.2)

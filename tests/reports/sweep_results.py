@@ -16,10 +16,10 @@ import torch
 from PIL import Image
 
 from tensor_stereo.configs import ConsensusConfig
-from tensor_stereo.evaluation import ROW_SCHEMA
-from tensor_stereo.metrics import confusion_update, roc_update
+from tensor_stereo.evaluation.dataset import ROW_SCHEMA
+from tensor_stereo.evaluation.metrics import confusion_update, roc_update
+from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES
 from tensor_stereo.reports.sweep.results import ERROR_COLUMNS, Overlay, RunResults
-from tensor_stereo.trials import SCORE_BINS, STAGES
 
 SCENES = ("Art", "Books", "Cones", "Dolls", "Laundry", "Moebius", "Reindeer", "Teddy")
 _INCORRECT = {"sift": 0.15, "fast": 0.5, "surf": 0.7, "gftt": 0.42}  # about what the detectors give
@@ -78,8 +78,8 @@ def make_results(
 ) -> pl.DataFrame:
     """One row per pair and trial.
 
-    Verdicts and scores of some hundred matches are drawn for each, and counted by ``tensor_stereo.metrics``. ``gain``
-    makes the correct matches score higher.
+    Verdicts and scores of some hundred matches are drawn for each, and counted by ``tensor_stereo.evaluation.metrics``.
+    ``gain`` makes the correct matches score higher.
     """
     rows = []
     trials = make_grid() if grid is None else grid

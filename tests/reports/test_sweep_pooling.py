@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES
 from tensor_stereo.reports.sweep.curves import detector_curves
 from tensor_stereo.reports.sweep.pooling import (
     CELLS,
@@ -24,7 +25,6 @@ from tensor_stereo.reports.sweep.pooling import (
     varying_settings,
     worst_pairs,
 )
-from tensor_stereo.trials import SCORE_BINS, STAGES
 from tests.reports.sweep_results import make_grid, make_results
 
 SMALL = make_grid(("fast", "sift"), outlier_rates=(0.0, 0.3), scores=("none", "topology"))

@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.scores.evidence import NUM_VALUES, ImageEvidence
+from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.scores.learned import LearnedScore
 from tensor_stereo.types import Matches
 from tests.oracles import neighbor_sets

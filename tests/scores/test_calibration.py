@@ -18,7 +18,7 @@ from tensor_stereo.configs import UNRECTIFIED, FilterConfig
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.calibration import calibrate_consensus, keep_by_target
 from tensor_stereo.scores.consensus import consensus_belief
-from tests.test_filters import random_pair
+from tests.test_classification import random_pair
 
 GRID = st.integers(0, 16).map(lambda k: k / 16)  # ties, sums and products of these are exact
 

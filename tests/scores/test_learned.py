@@ -15,7 +15,13 @@ from tensor_stereo.datasets import render_pair
 from tensor_stereo.features import to_gray
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.pipeline import Stopwatch, match_pairs
-from tensor_stereo.scores.evidence import MAX_DISPARITIES, NUM_VALUES, ImageEvidence, measure_images, search_ranges
+from tensor_stereo.scores.image_evidence import (
+    MAX_DISPARITIES,
+    NUM_VALUES,
+    ImageEvidence,
+    measure_images,
+    search_ranges,
+)
 from tensor_stereo.scores.learned import load_learned, score_learned
 from tensor_stereo.types import Matches, StereoPair
 

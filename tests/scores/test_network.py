@@ -11,9 +11,9 @@ import torch
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores import learned
-from tensor_stereo.scores.evidence import ImageEvidence
+from tensor_stereo.scores.image_evidence import ImageEvidence
 from tensor_stereo.scores.learned import LearnedScore, load_learned, score_learned
-from tensor_stereo.scores.quantities import Quantities, measure_quantities
+from tensor_stereo.scores.learned_inputs import Quantities, measure_quantities
 from tensor_stereo.types import Adjacency, Matches
 from tests.scores.learned_oracle import infer, random_evidence, random_pairs, see, weights_of
 

@@ -60,7 +60,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
 def expected(inputs: Inputs) -> pl.DataFrame:
     """The rows of that sweep, computed in this process by :func:`score_dataset`."""
     from tensor_stereo.datasets import PairDataset, read_manifest
-    from tensor_stereo.evaluation import score_dataset
+    from tensor_stereo.evaluation.dataset import score_dataset
 
     rows = score_dataset(PairDataset(read_manifest(inputs.manifest)), inputs.config)
     return rows.drop("seconds")

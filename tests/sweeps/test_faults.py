@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from multiprocessing import active_children
 from pathlib import Path
 
@@ -154,7 +155,7 @@ def test_only_the_unit_that_kills_its_worker_fails(inputs: Inputs, expected: pl.
     plan = build_plan(inputs.config, read_manifest(inputs.manifest))
     out = tmp_path / "run"
     units = list(range(plan.num_units))
-    with RunStore(out, {"format": FORMAT}, pl.DataFrame({"scene": [1]})) as store:
+    with RunStore(out, {"format": FORMAT, "sweep": asdict(inputs.config)}, pl.DataFrame({"scene": [1]})) as store:
         summary = drive(_DeadlyEngine(inputs.config, {3, 8}), plan, store, units, units)
     assert summary.progress.num_done == 12
     assert summary.progress.num_failed == 2

@@ -6,9 +6,9 @@ import pytest
 
 from tensor_stereo.configs import VERDICTS, SweepConfig, TrialConfig
 from tensor_stereo.datasets import PairFiles
-from tensor_stereo.datasets.synthetic import render_pair
+from tensor_stereo.datasets.synthetic.rendering import render_pair
+from tensor_stereo.evaluation.trials import STAGES, TrialRunner
 from tensor_stereo.sweeps import Plan, build_plan, expand_grid
-from tensor_stereo.trials import STAGES, TrialRunner
 
 GRID = {
     "detector": ["fast", "gftt"],
@@ -61,7 +61,7 @@ def test_costs_are_what_a_runner_does(
     config: SweepConfig, graphs: int, scores: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The runs of each stage that the plan promises, counted while the trials run."""
-    import tensor_stereo.trials as trials
+    import tensor_stereo.evaluation.trials as trials
 
     counted = dict.fromkeys(STAGES, 0)
     stages = {

@@ -3,19 +3,22 @@ from __future__ import annotations
 import errno
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 import polars as pl
 import pytest
 
 from tensor_stereo import atomic
+from tensor_stereo.configs import SweepConfig, TrialConfig
 from tensor_stereo.sweeps import RunInUseError, read_errors, read_results
 from tensor_stereo.sweeps.journal import read_journals
 from tensor_stereo.sweeps.store import FORMAT, METRICS_SCHEMA, RunStore
 from tensor_stereo.sweeps.units import UnitResult
 
 MANIFEST = pl.DataFrame({"scene": ["a", "b"]})
-CONFIG = {"format": FORMAT, "grid": [1, 2], "manifest": {"num_pairs": 2}}
+SWEEP = asdict(SweepConfig((TrialConfig(verdict="cardinality", score="none"),)))
+CONFIG = {"format": FORMAT, "sweep": SWEEP, "manifest": {"num_pairs": 2}}
 
 
 def _good(unit: int) -> UnitResult:
@@ -197,8 +200,8 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with _open(out) as store:
         store.add(_good(0))
-    with pytest.raises(ValueError, match=r"grid\[1\] is 2 there, 3 here"):
-        RunStore(out, CONFIG | {"grid": [1, 3]}, MANIFEST)
+    with pytest.raises(ValueError, match=r"manifest\.num_pairs is 2 there, 3 here"):
+        RunStore(out, CONFIG | {"manifest": {"num_pairs": 3}}, MANIFEST)
     assert _units(out) == [0]
 
 

@@ -11,9 +11,9 @@ import polars as pl
 import torch
 
 from tensor_stereo.configs import DETECTORS, ConsensusConfig
-from tensor_stereo.metrics import Confusion, ScoreCounts
+from tensor_stereo.evaluation.metrics import Confusion, ScoreCounts
+from tensor_stereo.evaluation.trials import SCORE_BINS, SENSITIVITY
 from tensor_stereo.reports.sweep.results import COUNTS
-from tensor_stereo.trials import SCORE_BINS, SENSITIVITY
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ def write_report(runs: Sequence[RunResults], out: Path) -> list[Path]:
     Example:
         >>> import tempfile
         >>> import polars as pl
-        >>> from tensor_stereo.datasets.synthetic import SyntheticDataset
-        >>> from tensor_stereo.evaluation import score_dataset
+        >>> from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
+        >>> from tensor_stereo.evaluation.dataset import score_dataset
         >>> from tensor_stereo.reports.sweep.results import ERROR_COLUMNS
         >>> from tensor_stereo.configs import SweepConfig
         >>> table = score_dataset(SyntheticDataset(1), SweepConfig()).with_columns(unit=0, host=pl.lit("here"))

@@ -8,8 +8,8 @@ from typing import Any
 
 import polars as pl
 
-from tensor_stereo.evaluation import ROW_SCHEMA
-from tensor_stereo.trials import SCORE_BINS
+from tensor_stereo.evaluation.dataset import ROW_SCHEMA
+from tensor_stereo.evaluation.trials import SCORE_BINS
 
 RESULT_COLUMNS = ("unit", *ROW_SCHEMA, "host")
 ERROR_COLUMNS = ("unit", "dataset", "scene", "detector", "stage", "error", "message", "attempts")
@@ -44,7 +44,7 @@ class RunResults:
     Attributes:
         name: what the report calls the run.
         results: one row per unit (one pair under one detector setting) and trial (one point of the grid), with the
-            columns of :data:`tensor_stereo.evaluation.ROW_SCHEMA` and ``unit``, ``host``; none is fine.
+            columns of :data:`tensor_stereo.evaluation.dataset.ROW_SCHEMA` and ``unit``, ``host``; none is fine.
         errors: one row per failed unit, columns ``ERROR_COLUMNS``.
         config: settings of the run, ready for JSON.
         environment: versions and machine of each session that worked on the run.

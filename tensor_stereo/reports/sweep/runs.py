@@ -9,11 +9,11 @@ from pathlib import Path
 import polars as pl
 
 from tensor_stereo.datasets import PairFiles, read_manifest, read_pair
+from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.reports.sweep.overlays import draw_overlay
 from tensor_stereo.reports.sweep.pooling import worst_pairs
 from tensor_stereo.reports.sweep.results import Overlay, RunResults
 from tensor_stereo.sweeps import read_config, read_errors, read_results
-from tensor_stereo.trials import TrialRunner
 
 LOG = logging.getLogger(__name__)
 

@@ -1,0 +1,247 @@
+"""One pair through many settings: what they share is computed once."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.classification import apply_score, classify_graphs
+from tensor_stereo.configs import CUTS, TrialConfig
+from tensor_stereo.evaluation.metrics import confusion_update, matches_against_gt, roc_update
+from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
+from tensor_stereo.graphs import MatchGraphs, build_match_graphs
+from tensor_stereo.matching import match_features
+from tensor_stereo.objects import group_matches, label_objects
+from tensor_stereo.pipeline import Stopwatch, detect_pairs, score_pairs, to_gray_pairs
+from tensor_stereo.types import Classification, Matches, Relation, StereoPair
+
+STAGES = ("detect", "match", "perturb", "group", "graph", "relate", "score")
+SCORE_BINS = 128  # equal bins of [0, 1] in which the rows count scores
+SENSITIVITY = 0.96  # where the paper reads the specificity
+_OUTDATED = {"graph": ("graph", "relate", "score"), "relate": (), "score": ()}  # what a new result makes useless
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One pair under one setting.
+
+    Attributes:
+        pair: the images and their ground truth.
+        config: the setting.
+        matches: the putative matches, exchanged and moved as the setting says, with ``group`` if constrained.
+        correct: (M,) bool, the disparity is right.
+        valid: (M,) bool, ground truth is known; all False for a pair without.
+        graphs: the Delaunay graphs of both views.
+        classification: the set tests; ``inlier`` follows the verdict that the setting names.
+        score: (M,), higher is better; None if the setting asks for none.
+        seconds: wall time of each of ``STAGES``, also where it was shared with other trials.
+    """
+
+    pair: StereoPair
+    config: TrialConfig
+    matches: Matches
+    correct: Tensor
+    valid: Tensor
+    graphs: MatchGraphs
+    classification: Classification
+    score: Tensor | None
+    seconds: dict[str, float]
+
+    def row(self) -> dict[str, Any]:
+        """One record, whose fields :func:`tensor_stereo.score_dataset` documents."""
+        config = self.config
+        confusion = confusion_update(self.classification.inlier, self.correct, self.valid)
+        rates = confusion.rates()
+        return {
+            "dataset": self.pair.dataset,
+            "scene": scene_name(self.pair),
+            **setting_columns(config),
+            "num_matches": self.matches.num_matches,
+            "num_valid": confusion.num_valid,
+            "num_untested": int((self.classification.relation == Relation.UNTESTED).sum()),
+            "true_positive": confusion.true_positive,
+            "false_positive": confusion.false_positive,
+            "true_negative": confusion.true_negative,
+            "false_negative": confusion.false_negative,
+            "fraction_incorrect": rates.fraction_incorrect,
+            "sensitivity": rates.sensitivity,
+            "specificity": rates.specificity,
+            "ppv": rates.ppv,
+            "npv": rates.npv,
+            **self._score_row(),
+            "seconds": self.seconds,
+        }
+
+    def _score_row(self) -> dict[str, Any]:
+        if self.score is None:
+            names = ("auc", "specificity_at_sensitivity_96", "score_counts_correct", "score_counts_incorrect")
+            return dict.fromkeys(names)
+        counts = roc_update(self.score, self.correct, valid=self.valid)
+        cell = (self.score.detach().double() * SCORE_BINS).long().clamp(0, SCORE_BINS - 1)
+        correct, incorrect = (
+            cell[self.valid & (self.correct == wanted)].bincount(minlength=SCORE_BINS).tolist()
+            for wanted in (True, False)
+        )
+        return {
+            "auc": counts.auc(),
+            "specificity_at_sensitivity_96": counts.specificity_at(SENSITIVITY),
+            "score_counts_correct": correct,
+            "score_counts_incorrect": incorrect,
+        }
+
+
+def setting_columns(config: TrialConfig) -> dict[str, Any]:
+    """The settings of a trial as columns of a row; None where a setting does not apply.
+
+    >>> setting_columns(TrialConfig(detector="sift"))["max_ratio"]
+    0.8
+    """
+    features, score = getattr(config, config.detector), config.resolved_score
+    return {
+        "detector": config.detector,
+        "feature_backend": getattr(features, "backend", None),
+        "window_px": getattr(features, "window_px", None),
+        "max_ratio": config.resolved_matching.max_ratio,
+        "mutual": config.matching.mutual,
+        "max_row_offset_px": config.matching.max_row_offset_px,
+        "min_disparity_px": config.matching.min_disparity_px,
+        "max_disparity_px": config.matching.max_disparity_px,
+        "variant": "constrained" if config.constrained else "unconstrained",
+        "verdict": config.verdict,
+        "min_group_size": config.min_group_size,
+        "tie_tolerance": config.tie_tolerance,
+        "outlier_rate": config.outlier_rate,
+        "noise_px": config.noise_px,
+        "seed": config.seed,
+        "score": score,
+        "temperature": config.temperature if score == "topology" else None,
+        "temperature_unit": config.temperature_unit if score == "topology" else None,
+        **{
+            f"consensus_{name}": value if score == "consensus" else None
+            for name, value in vars(config.consensus).items()
+        },
+        **{name: getattr(config, name) for name in CUTS},
+    }
+
+
+def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
+    """What the result of each stage depends on; trials with equal keys share it.
+
+    >>> trial = TrialConfig()
+    >>> keys, other = stage_keys(trial), stage_keys(replace(trial, verdict="adjacency"))
+    >>> [stage for stage in STAGES if keys[stage] != other[stage]]
+    ['relate', 'score']
+    """
+    features = getattr(trial, trial.detector)
+    if trial.detector == "sift":
+        features = replace(features, max_ratio=None)  # a setting of the matcher
+    keys: dict[str, Hashable] = {"detect": (trial.detector, features)}
+    keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
+    keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed, trial.max_error_px
+    if trial.constrained:
+        keys["label"] = trial.objects  # of the images alone
+    keys["group"] = keys["perturb"], trial.objects if trial.constrained else None
+    keys["graph"] = keys["group"], trial.tie_tolerance, trial.backend
+    keys["relate"] = keys["graph"], trial.verdict == "adjacency", trial.min_group_size
+    used = {
+        "topology": (trial.temperature, trial.temperature_unit),
+        "consensus": trial.consensus,
+    }
+    keys["score"] = keys["graph"], trial.resolved_score, used.get(trial.resolved_score)
+    return keys
+
+
+class TrialRunner:
+    """Runs trials on one pair; a stage runs again only when its settings, or those of a stage before it, change.
+
+    One result of each stage is held, and all verdicts and scores of the last graphs, so trials that share stages should
+    follow one another.
+
+    Args:
+        pair: images, with or without ground truth.
+
+    Example:
+        >>> from tensor_stereo.datasets.synthetic.rendering import render_pair
+        >>> runner = TrialRunner(render_pair(0))
+        >>> first, second = (runner.run(TrialConfig(verdict=name)) for name in ("adjacency", "cardinality"))
+        >>> first.graphs is second.graphs
+        True
+    """
+
+    def __init__(self, pair: StereoPair) -> None:
+        self.pair = pair
+        self.stage = "read"  # under way, for whoever reports an error
+        self._gray = to_gray_pairs([(pair.image0, pair.image1)])
+        self._held: dict[str, dict[Hashable, tuple[Any, float]]] = {}
+
+    @torch.no_grad()
+    def run(self, trial: TrialConfig) -> Trial:
+        """Run one trial. No gradient.
+
+        Raises:
+            ValueError: for bad settings, or ground truth that does not cover the keypoints.
+        """
+        keys = stage_keys(trial)
+        seconds = dict.fromkeys(STAGES, 0.0)
+
+        def share(stage: str, compute: Callable[[], _Result]) -> _Result:
+            held = self._held.setdefault(stage, {})
+            if keys[stage] not in held:
+                self.stage = stage
+                watch = Stopwatch({stage: 0.0})
+                with watch.measure(stage):
+                    value = compute()
+                for name in _OUTDATED.get(stage, (stage,)):
+                    self._held.get(name, {}).clear()
+                held[keys[stage]] = value, watch.seconds[stage]
+            result: _Result
+            result, seconds[stage] = held[keys[stage]]
+            return result
+
+        features = share("detect", lambda: detect_pairs(self._gray, trial))
+        putative = share("match", lambda: match_features(*features, trial))
+        matches, correct, valid = share("perturb", lambda: self._perturb(putative, trial))
+        if trial.constrained:
+            labels = share("label", lambda: [label_objects(image, trial.objects) for image in self._gray[0]])
+            matches = share("group", lambda: replace(matches, group=group_matches(matches, *labels)))
+            seconds["group"] += seconds.pop("label")
+        graphs = share(
+            "graph",
+            lambda: build_match_graphs(matches, tie_tolerance=trial.tie_tolerance, backend=trial.backend),
+        )
+        verdict = share(
+            "relate",
+            lambda: classify_graphs(graphs, trial),
+        )
+        score = None
+        if trial.resolved_score != "none":
+            score = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
+        if score is not None:
+            verdict, score = apply_score(verdict, score, matches.ptr, trial)
+        return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, seconds)
+
+    def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor, Tensor]:
+        """The matches as the setting wants them, and what ground truth says of them."""
+        name = f"{trial.seed}/{self.pair.dataset}/{scene_name(self.pair)}"
+        seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") >> 1
+        generator = torch.Generator().manual_seed(seed)
+        if trial.outlier_rate:
+            matches = inject_outliers(matches, trial.outlier_rate, generator)
+        if trial.noise_px:
+            height, width = self.pair.image0.shape[1:]
+            matches = add_noise(matches, trial.noise_px, generator, [(height, width)])
+        if self.pair.disparity_gt is None:
+            unknown = torch.zeros(matches.num_matches, dtype=torch.bool)
+            return matches, unknown, unknown
+        return matches, *matches_against_gt(matches, [self.pair.disparity_gt], max_error_px=trial.max_error_px)
+
+
+def scene_name(pair: StereoPair) -> str:
+    """Name of a pair within its dataset, also where a data set of several releases names it ``dataset/scene``."""
+    return pair.name.removeprefix(f"{pair.dataset}/")

@@ -1,0 +1,168 @@
+"""One pair of image files -> a table of matches and verdicts, and a figure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from tensor_stereo.classification import verdicts_by_name
+from tensor_stereo.configs import PipelineConfig, describe_settings
+from tensor_stereo.datasets import PairFiles, read_pair
+from tensor_stereo.evaluation.metrics import Rates, match_rates, matches_against_gt
+from tensor_stereo.features import to_gray
+from tensor_stereo.objects import trace_objects
+from tensor_stereo.pipeline import PipelineOutput, run_pipeline
+from tensor_stereo.reports.figures import draw_classification, write_figure
+from tensor_stereo.types import Relation, StereoPair
+
+Truth = tuple[Tensor, Tensor]  # correct (M,) and valid (M,), bool
+ENDINGS = (".csv", ".parquet")
+
+
+@dataclass(frozen=True)
+class MatchSummary:
+    """Counts over the matches of one pair, and the rates if ground truth is given.
+
+    Attributes:
+        num_matches: Putative matches.
+        num_kept: Those that the verdict of the settings keeps.
+        num_rejected: Those that it rejects on evidence.
+        num_untested: Those without evidence, which it rejects too.
+        kept_by: What each verdict keeps: ``adjacency``, ``cardinality``, and ``score`` if there is one that can decide.
+        rates: Of the verdict of the settings against ground truth, or None.
+    """
+
+    num_matches: int
+    num_kept: int
+    num_rejected: int
+    num_untested: int
+    kept_by: dict[str, int]
+    rates: Rates | None = None
+
+
+def classify_files(
+    left: Path | str,
+    right: Path | str,
+    config: PipelineConfig | None = None,
+    *,
+    disparity_gt: Path | str | None = None,
+    gt_scale: float | None = None,
+    out: Path | str | None = None,
+    figure: Path | str | None = None,
+) -> MatchSummary:
+    """Match two image files of a rectified pair and decide which matches are right.
+
+    Args:
+        left: Image of view 0.
+        right: Image of view 1, of the same size.
+        config: Settings of every step; None means the defaults.
+        disparity_gt: Ground truth of view 0, PFM or PNG.
+        gt_scale: Stored value / px of disparity in a PNG map.
+        out: File .csv or .parquet for :func:`match_table`.
+        figure: File .png for both views, their matches by every verdict that decides, and their graphs.
+
+    Returns:
+        How many matches each verdict keeps.
+
+    Raises:
+        ValueError: for damaged images, views of different size, or another ending of ``out`` or ``figure``.
+        FileNotFoundError: if a file or the folder of a result is missing.
+    """
+    config = config or PipelineConfig()
+    left, right = Path(left), Path(right)
+    disparity_gt, out, figure = (None if path is None else Path(path) for path in (disparity_gt, out, figure))
+    if out is not None and out.suffix not in ENDINGS:
+        raise ValueError(f"out must end in {' or '.join(ENDINGS)}, got {out.name!r}")
+    if figure is not None and figure.suffix != ".png":
+        raise ValueError(f"figure must end in .png, got {figure.name!r}")
+    for name, path in (("out", out), ("figure", figure)):
+        if path is not None and not path.parent.is_dir():
+            raise FileNotFoundError(f"{name}: there is no folder {path.parent}")
+    pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale))
+    output = run_pipeline([(pair.image0, pair.image1)], config)
+    truth = None if pair.disparity_gt is None else matches_against_gt(output.matches, [pair.disparity_gt])
+    if out is not None:
+        table = match_table(output, config, truth)
+        table.write_csv(out) if out.suffix == ".csv" else table.write_parquet(out)
+    if figure is not None:
+        write_figure(_draw(pair, output, config, truth), figure)
+    verdict = output.classification
+    num_untested = int((verdict.relation == Relation.UNTESTED).sum())
+    num_kept = int(verdict.inlier.sum())
+    return MatchSummary(
+        num_matches=output.matches.num_matches,
+        num_kept=num_kept,
+        num_rejected=output.matches.num_matches - num_kept - num_untested,
+        num_untested=num_untested,
+        kept_by={name: int(kept.sum()) for name, kept in _verdicts(output, config).items()},
+        rates=None if truth is None else match_rates(verdict.inlier, *truth),
+    )
+
+
+def match_table(
+    output: PipelineOutput, config: PipelineConfig | None = None, truth: Truth | None = None
+) -> pl.DataFrame:
+    """One row per match of one pair.
+
+    Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained; ``inlier``, what the
+    verdict of the settings says; ``probability`` of an error of at most 1 px, or ``score`` where that is none;
+    ``inlier_adjacency``, ``inlier_cardinality`` and, if there is a score that can decide, ``inlier_score``;
+    ``relation`` by name, ``overlap, degree0, degree1``; and with ``truth`` = (correct, valid) also ``correct``, null
+    where ground truth is not known. ``config`` is that of the output; None means the defaults.
+    """
+    config = config or PipelineConfig()
+    matches, verdict = output.matches, output.classification
+    columns = {
+        "x0": matches.keypoints0[:, 0],
+        "y0": matches.keypoints0[:, 1],
+        "x1": matches.keypoints1[:, 0],
+        "y1": matches.keypoints1[:, 1],
+        "disparity": matches.disparity,
+        "cost": matches.cost,
+        "group": matches.group,
+        "inlier": verdict.inlier,
+        "probability" if config.is_probability else "score": output.score,
+        **{f"inlier_{name}": kept for name, kept in _verdicts(output, config).items()},
+        "relation": verdict.relation,
+        "overlap": verdict.overlap,
+        "degree0": verdict.degree0,
+        "degree1": verdict.degree1,
+    }
+    table = pl.DataFrame({name: column.numpy() for name, column in columns.items() if column is not None})
+    names = {relation.value: relation.name.lower() for relation in Relation}
+    table = table.with_columns(pl.col("relation").replace_strict(names, return_dtype=pl.String))
+    if truth is None:
+        return table
+    correct, valid = (pl.Series(name, values.numpy()) for name, values in zip(("correct", "valid"), truth, strict=True))
+    return table.with_columns(pl.when(valid).then(correct).alias("correct"))
+
+
+def _verdicts(output: PipelineOutput, config: PipelineConfig) -> dict[str, Tensor]:
+    return verdicts_by_name(output.classification, output.score, config)
+
+
+def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, truth: Truth | None) -> Figure:
+    correct, valid = truth if truth is not None else (None, None)
+    images = pair.image0, pair.image1
+    verdicts = _verdicts(output, config)
+    shown = {describe_settings(config): output.classification.inlier}
+    if config.verdict == "score":
+        shown["cardinality"] = verdicts["cardinality"]
+    contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in images if config.constrained]
+    return draw_classification(
+        *images,
+        output.matches,
+        shown,
+        output.graphs.adjacency0,
+        output.graphs.adjacency1,
+        tested=output.classification.relation != Relation.UNTESTED,
+        correct=correct,
+        valid=valid,
+        contours0=contours[0] if contours else None,
+        contours1=contours[1] if contours else None,
+        title=f"{pair.name}, {config.detector.upper()}",
+    )

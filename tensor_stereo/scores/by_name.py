@@ -1,0 +1,81 @@
+"""The scores by name, of matches whose graphs may exist already."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from tensor_stereo.configs import FilterConfig
+from tensor_stereo.graphs import MatchGraphs, build_match_graphs
+from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.domain import check_domain
+from tensor_stereo.scores.image_evidence import ImageEvidence, measure_images
+from tensor_stereo.scores.learned import LearnedScore, score_learned
+from tensor_stereo.soft import build_soft_graphs, count_soft_neighbors, soft_jaccard
+from tensor_stereo.types import Matches
+
+
+def score_matches(
+    matches: Matches,
+    config: FilterConfig | None = None,
+    graphs: MatchGraphs | None = None,
+    *,
+    images: tuple[Sequence[Tensor], Sequence[Tensor]] | None = None,
+    evidence: ImageEvidence | None = None,
+    temperature: Tensor | None = None,
+    network: LearnedScore | None = None,
+) -> tuple[Tensor, MatchGraphs]:
+    """Score every match, by the score that the settings name.
+
+    Args:
+        matches: B pairs.
+        config: The settings; None means the defaults.
+        graphs: The graphs of the same matches, under the same tolerance; None: they are built. ``topology`` builds them
+            in one pass with the pairs that it needs, whether they are given or not.
+        images: The B images of view 0 and those of view 1, at which ``learned`` looks, as
+            :func:`tensor_stereo.scores.image_evidence.measure_images` takes them.
+        evidence: What the images say, if that was measured before; instead of ``images``.
+        temperature: () of ``topology``, in place of that of the settings, for gradients.
+        network: The network of ``learned``; None means the one with the weights of this package.
+
+    Returns:
+        (M,) score in [0, 1], higher is better, also of matches that a verdict leaves UNTESTED; and the graphs. That of
+        ``consensus`` and of ``learned`` is the calibrated probability of an error of at most 1 px in a rectified pair;
+        that of ``topology`` is a similarity. Gradients as the scores say.
+
+    Raises:
+        ValueError: if the settings want no score, or for coordinates beyond 2**24 px, which only ``topology`` takes.
+        TypeError: for images or evidence beside a score that looks at none.
+
+    Example:
+        >>> import torch
+        >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
+        >>> matches = Matches(left, left - torch.tensor([2.0, 0.0]), torch.tensor([0, 50]))
+        >>> score, graphs = score_matches(matches)
+        >>> torch.equal(score_matches(matches, graphs=graphs)[0], score)
+        True
+    """
+    config = config or FilterConfig()
+    name = config.resolved_score
+    for argument, value in (("images", images), ("evidence", evidence)):
+        if value is not None and name != "learned":
+            raise TypeError(f"{argument} must be None where the score is {name!r}, which looks at no image")
+    if images is not None and evidence is not None:
+        raise TypeError("evidence must be None beside images, of which it would be measured")
+    if name == "none":
+        raise ValueError("config must name a score, got 'none'")
+    options = {"tie_tolerance": config.tie_tolerance, "backend": config.backend}
+    if name == "topology":
+        heat = config.temperature if temperature is None else temperature
+        found = build_soft_graphs(matches, heat, unit=config.temperature_unit, **options)  # type: ignore[arg-type]
+        counts = count_soft_neighbors(matches, found, heat, unit=config.temperature_unit, **options)  # type: ignore[arg-type]
+        return soft_jaccard(counts), found.graphs
+    if graphs is None:
+        graphs = build_match_graphs(matches, **options)  # type: ignore[arg-type]
+    check_domain(matches, graphs, config)
+    if name == "consensus":
+        return consensus_score(matches, graphs, config), graphs
+    if images is not None:
+        evidence = measure_images(*images, matches, graphs)
+    return score_learned(matches, graphs, evidence, config, network=network), graphs

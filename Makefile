@@ -65,14 +65,15 @@ fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFu
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
 
 BENCH_VENV ?= .venv-bench
-SUITES := graphs relations classify soft matching pipeline scaling adversarial sweep scores accuracy
+SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/scaling \
+  speed/adversarial speed/sweep speed/scores accuracy/ranking accuracy/soft_ranking
 
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)
 	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet -c $(CONSTRAINTS) torch kornia numpy scipy mahotas polars rich tyro \
 	  matplotlib pillow ray safetensors opencv-contrib-python-headless shull
 	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps --force-reinstall .
-	cd benchmarks && for suite in $(SUITES); do $(abspath $(BENCH_VENV))/bin/python bench_$$suite.py || exit 1; done
+	for suite in $(SUITES); do $(BENCH_VENV)/bin/python benchmarks/$$suite.py || exit 1; done
 
 hooks: $(READY)  ## Install the git hooks
 	$(BIN)/pre-commit install

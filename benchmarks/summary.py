@@ -1,16 +1,8 @@
-"""Print the README's tables from the stored results: ``python summary.py``."""
+"""Print the tables of the README from the stored results: ``python benchmarks/summary.py``."""
 
 from __future__ import annotations
 
-import json
-
-from harness import RESULTS
-
-
-def records(suite: str) -> list[dict]:
-    """What one suite has written, empty if it has not run."""
-    path = RESULTS / f"{suite}.json"
-    return json.loads(path.read_text())["records"] if path.exists() else []
+from shared.results import read_records
 
 
 def print_comparisons(*suites: str) -> None:
@@ -18,7 +10,7 @@ def print_comparisons(*suites: str) -> None:
     print("| task | ours, a pair, point or match | peer | time of the peer / ours, median [quartiles] |")
     print("|---|---|---|---|")
     ours: dict = {}
-    for record in (r for suite in suites for r in records(suite)):
+    for record in (r for suite in suites for r in read_records(suite)):
         if "case" not in record:
             continue
         if any(record[key] != ours.get(key) for key in ("title", "threads")):
@@ -35,7 +27,7 @@ def print_scores() -> None:
     """How the soft score ranks matches beside the hard one."""
     print("| putative matches | AUC hard | AUC soft | specificity at sensitivity .96, hard | soft |")
     print("|---|---|---|---|---|")
-    found = {r["title"]: r for r in records("soft") if "auc" in r}
+    found = {r["title"]: r for r in read_records("soft_ranking") if "auc" in r}
     for title, hard in found.items():
         name, kind = title.rsplit(", ", 1)
         if kind != "hard":

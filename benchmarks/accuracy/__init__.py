@@ -1,0 +1,1 @@
+"""How right scores and verdicts are, against ground truth."""

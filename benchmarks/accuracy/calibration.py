@@ -1,0 +1,58 @@
+"""What calibrated scores promise and what they hold: calibration error, and the rates that targets reach."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from shared.calibration_error import calibration_error
+from shared.harness import Suite
+
+import tensor_stereo as ts
+from accuracy.putatives import Putatives, to_images, to_matches
+from tensor_stereo.classification import classify_graphs
+from tensor_stereo.evaluation import match_rates
+from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.scores import calibrate_consensus, consensus_belief, keep_by_target, load_learned, measure_images
+
+TARGETS = ({"target_sensitivity": 0.9}, {"target_sensitivity": 0.96}, {"min_precision": 0.9}, {"min_precision": 0.95})
+
+
+def find_probabilities(found: list[Putatives]) -> tuple[ts.Matches, torch.Tensor, dict[str, torch.Tensor]]:
+    """All pairs as one batch, which of their matches are tested, and by name the probabilities of being correct."""
+    matches, network = to_matches(found, with_cost=True), load_learned()
+    graphs = build_match_graphs(matches)
+    belief = consensus_belief(matches, graphs)
+    evidence = measure_images(*to_images(found), matches, graphs)
+    plain, shown = network(matches, graphs), network(matches, graphs, evidence)
+    probabilities = {
+        "consensus + cost, raw": belief,
+        "consensus + cost": calibrate_consensus(belief),
+        "learned, no images": plain[1],
+        "learned, raw": torch.sigmoid(shown[0]),
+        "learned": shown[1],
+    }
+    return matches, classify_graphs(graphs).relation != 0, probabilities
+
+
+@torch.no_grad()
+def report_calibration(suite: Suite, title: dict[str, object], found: list[Putatives]) -> None:
+    """Note the error over the matches of all pairs, and for each target the mean over the pairs of what it reaches."""
+    matches, tested, probabilities = find_probabilities(found)
+    correct, valid = (torch.from_numpy(np.concatenate([getattr(p, n) for p in found])) for n in ("correct", "valid"))
+    known = valid & tested
+    name = ", ".join(map(str, title.values()))
+    for kind, probability in probabilities.items():
+        error = calibration_error(probability[known], correct[known])
+        suite.note(f"{name}, {kind}", calibration_error=error)
+        if kind.endswith("raw"):
+            continue
+        for target in TARGETS:
+            kept = keep_by_target(probability, tested, matches.ptr, **target)
+            rates = [
+                match_rates(*(values[start:stop] for values in (kept, correct, valid)))
+                for start, stop in zip(matches.ptr[:-1].tolist(), matches.ptr[1:].tolist(), strict=True)
+            ]
+            ((wanted, least),) = target.items()
+            reached = [r.sensitivity if wanted == "target_sensitivity" else r.npv for r in rates]
+            specificity = float(np.nanmean([r.specificity for r in rates]))
+            suite.note(f"{name}, {kind}, {wanted} {least}", reached=float(np.nanmean(reached)), specificity=specificity)

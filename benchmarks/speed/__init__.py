@@ -1,0 +1,1 @@
+"""Time and memory, ours and the peers' in the same run."""

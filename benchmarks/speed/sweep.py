@@ -1,0 +1,133 @@
+"""Sweeps: engines and workers against plain calls in one process, memory of a worker, resuming."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from multiprocessing import active_children
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+
+from tensor_stereo.configs import SweepConfig, TrialConfig
+from tensor_stereo.datasets import build_manifest, read_manifest, write_manifest, write_synthetic
+from tensor_stereo.sweeps import SweepProgress, build_plan, run_sweep
+from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
+from tensor_stereo.sweeps.units import UnitResult, run_tasks
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
+from shared.harness import Suite
+
+SETTINGS = {"detector": "fast", "verdict": "cardinality", "score": "consensus"}
+CONFIG = SweepConfig((TrialConfig(**SETTINGS),))
+NUM_UNITS = 3000  # more than a minute on one worker
+ROUNDS = 2
+
+
+def repeat(manifest: pl.DataFrame, count: int, path: Path) -> Path:
+    """The same pairs under ``count`` names."""
+    rows = manifest[np.arange(count) % len(manifest)]
+    write_manifest(rows.with_columns(scene=pl.Series([f"{k:06d}" for k in range(count)])), path)
+    return path
+
+
+def peak_mb() -> float:
+    """Largest resident memory that a child process has had."""
+    peaks = [0.0]
+    for child in active_children():
+        with contextlib.suppress(OSError):  # it has just ended
+            status = Path(f"/proc/{child.pid}/status").read_text()
+            peaks += [int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")]
+    return max(peaks)
+
+
+def timed_sweep(manifest: Path, folder: Path, watch: Callable[[], None] = lambda: None, **options: object) -> float:
+    """Seconds per unit of a new run, from the first report of progress on: workers are warm then."""
+    seen: list[tuple[float, int]] = []
+
+    def report(state: SweepProgress) -> None:
+        seen.append((time.perf_counter(), state.num_new))
+        watch()
+
+    out = folder / "run"
+    shutil.rmtree(out, ignore_errors=True)
+    summary = run_sweep(CONFIG, manifest, out, on_progress=report, **options)  # type: ignore[arg-type]
+    end = time.perf_counter()
+    assert summary.progress.num_failed == 0
+    return (end - seen[0][0]) / (summary.progress.num_new - seen[0][1])
+
+
+def plain_calls(manifest: Path) -> float:
+    """Seconds per unit of calls in this process: no queue, no store."""
+    plan = build_plan(CONFIG, read_manifest(manifest))
+    run_tasks(CONFIG, [plan.task(0)])
+    start = time.perf_counter()
+    for unit in range(plan.num_units):
+        run_tasks(CONFIG, [plan.task(unit)])
+    return (time.perf_counter() - start) / plan.num_units
+
+
+def main() -> None:
+    suite = Suite("sweep")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rendered = build_manifest([write_synthetic(folder, 24)])
+        manifest = repeat(rendered, NUM_UNITS, folder / "m.parquet")
+        cases: dict[str, Callable[[], float]] = {
+            "plain calls": lambda: plain_calls(manifest),
+            "local, 1 worker": lambda: timed_sweep(manifest, folder, num_workers=1),
+            "local, 2 workers": lambda: timed_sweep(manifest, folder, num_workers=2),
+            "ray, 2 workers": lambda: timed_sweep(manifest, folder, num_workers=2, engine="ray"),
+        }
+        seconds: dict[str, list[float]] = {case: [] for case in cases}
+        for _ in range(ROUNDS):
+            for case, call in cases.items():
+                seconds[case].append(call())
+                suite.note(f"FAST, {NUM_UNITS} units, {case}", ms_per_unit=1e3 * seconds[case][-1])
+        for title, above, below in (
+            ("2 workers / 1 worker", "local, 1 worker", "local, 2 workers"),
+            ("sweep of 1 worker / plain calls", "local, 1 worker", "plain calls"),
+            ("ray / local, 2 workers", "ray, 2 workers", "local, 2 workers"),
+        ):
+            ratios = [a / b for a, b in zip(seconds[above], seconds[below], strict=True)]
+            suite.note(title, ratio=statistics.median(ratios), lowest=min(ratios), highest=max(ratios))
+        peaks = {}
+        for count in (NUM_UNITS // 10, NUM_UNITS):
+            seen = [0.0]
+            few = repeat(rendered, count, folder / "few.parquet")
+            timed_sweep(few, folder, lambda seen=seen: seen.append(peak_mb()), num_workers=1)
+            peaks[count] = max(seen)
+        suite.note("peak memory of a worker in MB", **{f"{count} pairs": peak for count, peak in peaks.items()})
+        many = repeat(rendered, 10_000, folder / "many.parquet")
+        shutil.rmtree(folder / "run")
+        run_sweep(CONFIG, many, folder / "run", limit=0)
+        known = json.loads((folder / "run" / "config.json").read_text())
+        with RunStore(folder / "run", known, pl.read_parquet(many)) as store:
+            for unit in range(10_000):
+                store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0}]))
+        (folder / "sweep.toml").write_text("[grid]\n" + "".join(f'{k} = "{v}"\n' for k, v in SETTINGS.items()))
+        command = [sys.executable, "-P", "-m", "tensor_stereo", "sweep", str(folder / "sweep.toml")]
+        command += ["--manifest", str(many), "--out", str(folder / "run")]
+        resumed = []
+        for _ in range(5):
+            start = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True)
+            resumed.append(time.perf_counter() - start)
+        suite.note(
+            "resuming 10 000 finished units, whole process, s", median=statistics.median(resumed), highest=max(resumed)
+        )
+    suite.write()
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main()

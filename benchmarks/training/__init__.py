@@ -1,0 +1,1 @@
+"""What makes the weights and constants that the package ships."""

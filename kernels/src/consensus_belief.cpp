@@ -8,6 +8,7 @@
 
 #include "tensor_stereo/buffer.hpp"
 #include "tensor_stereo/parallel.hpp"
+#include "vector2.hpp"
 
 namespace tensor_stereo {
 namespace {
@@ -16,38 +17,35 @@ constexpr std::int64_t kGrain = 2048;
 constexpr double kMaxCost = 1e300, kCostFloor = 1e-2, kSpreadFloor = 0.1, kMaxEvidence = 8;  // as in the reference
 constexpr double kVanished = 1492;  // exp(-x / 2) is zero beyond, and the library function slow to say so
 
-// Two numbers in one register, x and y or u and v: the compiler does not find such pairs by itself.
-using Pair = double __attribute__((vector_size(16)));
-
 // Where a match lies in both views, in tolerances.
 struct Position {
-    Pair view[2];
+    Vector2 view[2];
 };
 
 // The displacement (u, v) around a match, relative to its own, in tolerances, and its slopes.
 struct Plane {
-    Pair at, by_x, by_y;
+    Vector2 at, by_x, by_y;
 };
 
 // What a neighbour says about a match, in tolerances.
 struct Vote {
-    Pair offset;      // from the match to the voter, halfway between the views
-    Pair difference;  // displacement of the voter minus that of the match
+    Vector2 offset;      // from the match to the voter, halfway between the views
+    Vector2 difference;  // displacement of the voter minus that of the match
 };
 
 inline Vote vote_of(const Position& voter, const Position& match) noexcept {
-    const Pair offset0 = voter.view[0] - match.view[0], offset1 = voter.view[1] - match.view[1];
-    return {(offset0 + offset1) / 2, offset1 - offset0};
+    const Vector2 offset0 = voter.view[0] - match.view[0], offset1 = voter.view[1] - match.view[1];
+    return {(offset0 + offset1) / 2.0, offset1 - offset0};
 }
 
 // Sums of weighted products around one match: the matrix and both right-hand sides of a least-squares plane.
 struct Moments {
     double one = 0, xy = 0;
-    Pair first{}, second{};  // of (x, y) and its squares
-    Pair at{}, by_x{}, by_y{};  // of (u, v), x (u, v) and y (u, v)
+    Vector2 first{}, second{};     // of (x, y) and its squares
+    Vector2 at{}, by_x{}, by_y{};  // of (u, v), x (u, v) and y (u, v)
 
     void add(const Vote& vote, double weight) noexcept {
-        const Pair weighted = weight * vote.offset;
+        const Vector2 weighted = weight * vote.offset;
         one += weight;
         first += weighted;
         second += weighted * vote.offset;
@@ -95,9 +93,10 @@ class Consensus {
           positions_(allocate<Position>(num_matches())),
           odds_(allocate<double>(num_matches())),
           planes_(allocate<Plane>(num_matches())),
-          weights_{allocate<double>(matches.crow[0][num_matches()]), allocate<double>(matches.crow[1][num_matches()])} {}
+          weights_{allocate<double>(num_edges(0)), allocate<double>(num_edges(1))} {}
 
     std::int64_t num_matches() const noexcept { return matches_.ptr[matches_.num_pairs]; }
+    std::int64_t num_edges(int view) const noexcept { return matches_.crow[view][num_matches()]; }
 
     // Scales the positions of one pair, and finds the odds of its matches and the first beliefs.
     void begin(std::int64_t pair, double* belief) noexcept {
@@ -108,7 +107,7 @@ class Consensus {
         for (std::int64_t row = begin; row < end; ++row) {
             for (int view = 0; view < 2; ++view) {
                 const double* const point = matches_.keypoints[view] + 2 * row;
-                positions_[row].view[view] = Pair{point[0], point[1]} / tolerance;
+                positions_[row].view[view] = Vector2{point[0], point[1]} / tolerance;
             }
         }
         std::fill(odds_.get() + begin, odds_.get() + end, 0.0);  // evidence, until its exponential is taken
@@ -127,7 +126,7 @@ class Consensus {
         for (int view = 0; view < 2; ++view) {
             const std::int64_t begin = matches_.crow[view][row], end = matches_.crow[view][row + 1];
             for (std::int64_t k = begin; k < end; ++k) {
-                const Pair way = positions_[matches_.cols[view][k]].view[view] - positions_[row].view[view];
+                const Vector2 way = positions_[matches_.cols[view][k]].view[view] - positions_[row].view[view];
                 const double squared = way[0] * way[0] + way[1] * way[1];
                 weights_[view][k] = squared;
                 sum += squared;
@@ -146,7 +145,7 @@ class Consensus {
     void fit(const double* belief, std::int64_t row) noexcept {
         Moments moments;
         each_vote(belief, row, [&moments](std::int64_t, const Vote& vote, double trust) {
-            const Pair squared = vote.difference * vote.difference;
+            const Vector2 squared = vote.difference * vote.difference;
             moments.add(vote, trust * (1 / (1 + squared[0] + squared[1])));
         });
         planes_[row] = moments.solve(1 / (settings_.slope * settings_.slope));
@@ -157,7 +156,7 @@ class Consensus {
         double agreed = 0, total = 0;
         each_vote(belief, row, [&](std::int64_t voter, const Vote& vote, double trust) {
             const Plane& plane = planes_[voter];
-            const Pair miss = vote.difference + plane.at - plane.by_x * vote.offset[0] - plane.by_y * vote.offset[1];
+            const Vector2 miss = vote.difference + plane.at - plane.by_x * vote.offset[0] - plane.by_y * vote.offset[1];
             const double squared = miss[0] * miss[0] + miss[1] * miss[1];
             if (!(squared > kVanished)) agreed += trust * std::exp(squared / -2);
             total += trust;

@@ -48,7 +48,8 @@ bool CriticalPoints::cross(Index h, const Critical& found) const noexcept {
 bool CriticalPoints::across(Index h, Critical& found) const noexcept {
     const Index* const origin = mesh_->origin.data();
     const Index twin = mesh_->twin[h];
-    const Index sides[4] = {previous_in_triangle(h), next_in_triangle(twin), next_in_triangle(h), previous_in_triangle(twin)};
+    const Index sides[4] = {previous_in_triangle(h), next_in_triangle(twin), next_in_triangle(h),
+                            previous_in_triangle(twin)};
     const Index i = origin[h], j = origin[twin], k = origin[sides[3]], l = origin[sides[0]];
     const Point* const p = mesh_->points.data();
     for (int side = 0; side < 4; ++side) {
@@ -56,11 +57,12 @@ bool CriticalPoints::across(Index h, Critical& found) const noexcept {
         const Index beyond = mesh_->twin[sides[side]];
         if (beyond == kNone) continue;
         const Point q = p[origin[previous_in_triangle(beyond)]];
-        const int inside = side < 2 ? incircle(p[k], p[l], p[i], q, mesh_->bounds) : incircle(p[l], p[k], p[j], q, mesh_->bounds);
+        const int inside =
+            side < 2 ? incircle(p[k], p[l], p[i], q, mesh_->bounds) : incircle(p[l], p[k], p[j], q, mesh_->bounds);
         if (inside == 0) return false;
     }
     found = {mesh_->vertex[j], mesh_->vertex[i], false};
-    if (is_out_of_reach(k, l, j, i)) found = kBlockedPair;
+    if (is_out_of_reach(k, l, j, i)) found = kBlockedLink;
     return true;
 }
 
@@ -75,20 +77,20 @@ Critical CriticalPoints::find_in_mesh(Index i, Index j) {
     const Index first = fan_[i], first_end = origin[next_in_triangle(first)];
     int right = turn(i, first_end, j);
     if (right == 0 && first_end == j) return in_reach(first, of_half_edge(first));
-    if (right == 0 && is_ahead(first_end)) return kBlockedPair;
+    if (right == 0 && is_ahead(first_end)) return kBlockedLink;
     for (Index h = first;;) {
         const Index back = previous_in_triangle(h), end = origin[back];
         const int left = turn(i, end, j);
         if (left == 0 && end == j) return in_reach(back, of_half_edge(back)).reversed();
-        if (left == 0 && is_ahead(end)) return kBlockedPair;
+        if (left == 0 && is_ahead(end)) return kBlockedLink;
         if (right > 0 && left < 0) return to_input(walk(i, j, h));
         right = left;
         h = twin[back];
-        if (h == kNone) return kBlockedPair;  // not in a triangulation
+        if (h == kNone) return kBlockedLink;  // not in a triangulation
     }
 }
 
-// The pair is half-edge h.
+// The link is half-edge h.
 Critical CriticalPoints::between(Index h) const {
     const auto side = [this](Index g) {
         return g == kNone ? kNone : first_of_polygon(g, mesh_->origin[previous_in_triangle(g)]);
@@ -99,7 +101,8 @@ Critical CriticalPoints::between(Index h) const {
 Critical CriticalPoints::in_reach(Index h, Critical found) const noexcept {
     if (found.right == kNone || found.left == kNone) return found;
     const Index i = mesh_->origin[h], j = mesh_->origin[next_in_triangle(h)];
-    return is_out_of_reach(i, j, rank_[found.right], rank_[found.left]) ? Critical{kBlocked, kBlocked, found.is_edge} : found;
+    if (is_out_of_reach(i, j, rank_[found.right], rank_[found.left])) return {kBlocked, kBlocked, found.is_edge};
+    return found;
 }
 
 // From i through the triangle of h, whose inside the segment enters, to j.
@@ -109,7 +112,8 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
     const Point p = mesh_->points[i], q = mesh_->points[j];
     const double dx = q.x - p.x, dy = q.y - p.y, span = std::fabs(dx) + std::fabs(dy);
     const double out_of_reach = -(1 + 1e-9) * reach(i, j);  // beyond doubt
-    double cross = 0;  // of the vector to j and that to the point looked at
+    double cross = 0;
+    // The end of the dual towards k; leaves the cross product of the vectors to j and to k in cross.
     const auto look = [&](Index k) -> End {
         const double x = mesh_->points[k].x - p.x, y = mesh_->points[k].y - p.y;
         cross = dx * y - dy * x;
@@ -122,18 +126,18 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
     left_.start(first_left, twin[previous_in_triangle(h)], look(first_left));
     h = twin[next_in_triangle(h)];
     while (true) {  // the segment enters a triangle through h, which runs from the left chain to the right one
-        if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return kBlockedPair;
+        if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return kBlockedLink;
         const Index to_left = previous_in_triangle(h), to_right = next_in_triangle(h);
         const Index apex = origin[to_left];
         if (apex == j) {
-            left_.links.push_back({j, twin[to_left]});
-            right_.links.push_back({j, twin[to_right]});
+            left_.corners.push_back({j, twin[to_left]});
+            right_.corners.push_back({j, twin[to_right]});
             break;
         }
         const End apex_end = look(apex);
         int side = sign(cross);
         if (std::fabs(cross) <= mesh_->bounds.orientation) side = turn(i, j, apex);
-        if (side == 0) return kBlockedPair;
+        if (side == 0) return kBlockedLink;
         if (side > 0) {
             add(left_, i, j, apex, twin[to_left], apex_end);
             h = twin[to_right];
@@ -143,7 +147,7 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
         }
     }
     const Critical found{first_of_best(j, i, right_), first_of_best(i, j, left_), false};
-    return is_out_of_reach(i, j, found.right, found.left) ? kBlockedPair : found;
+    return is_out_of_reach(i, j, found.right, found.left) ? kBlockedLink : found;
 }
 
 // Appends to the left or the right chain; rounding decides nothing.
@@ -153,13 +157,13 @@ void CriticalPoints::add(Chain& chain, Index i, Index j, Index vertex, Index bey
     int inside = sign(gain);
     if (!(std::fabs(gain) > chain.best_end.error + end.error)) {
         const Point* const p = mesh_->points.data();
-        const Index best = chain.links[chain.best].vertex;
+        const Index best = chain.corners[chain.best].vertex;
         inside = is_left ? incircle(p[i], p[j], p[best], p[vertex], mesh_->bounds)
                          : incircle(p[j], p[i], p[best], p[vertex], mesh_->bounds);
     }
-    chain.links.push_back({vertex, beyond});
+    chain.corners.push_back({vertex, beyond});
     if (inside > 0) {
-        chain.best = chain.links.size() - 1;
+        chain.best = chain.corners.size() - 1;
         chain.best_end = end;
         chain.any_tie = false;
     } else if (inside == 0) {
@@ -170,16 +174,17 @@ void CriticalPoints::add(Chain& chain, Index i, Index j, Index vertex, Index bey
 // Of the best vertices of a chain on the left of i -> j, and of all others on their circle, the first.
 Index CriticalPoints::first_of_best(Index i, Index j, const Chain& chain) const {
     const Point* const p = mesh_->points.data();
-    const std::size_t last = chain.links.size() - 1;  // an end of the segment
-    const Index apex = chain.links[chain.best].vertex;
+    const std::size_t last = chain.corners.size() - 1;  // an end of the segment
+    const Index apex = chain.corners[chain.best].vertex;
     const auto is_on_circle = [&](Index v) { return incircle(p[i], p[j], p[apex], p[v], mesh_->bounds) == 0; };
     Index first = apex;
     bool before_on_circle = true;  // the other end of the segment
     for (std::size_t k = 0; k <= last; ++k) {
-        const auto [v, beyond] = chain.links[k];
+        const auto [v, beyond] = chain.corners[k];
         const bool on_circle = k == chain.best || k == last || (chain.any_tie && is_on_circle(v));
         if (on_circle && k != last && is_before(v, first)) first = v;
-        if (on_circle && before_on_circle && beyond != kNone && is_on_circle(mesh_->origin[previous_in_triangle(beyond)])) {
+        if (on_circle && before_on_circle && beyond != kNone &&
+            is_on_circle(mesh_->origin[previous_in_triangle(beyond)])) {
             first = first_of_polygon(beyond, first);
         }
         before_on_circle = on_circle;

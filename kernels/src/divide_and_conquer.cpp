@@ -1,11 +1,11 @@
 // Guibas & Stolfi, "Primitives for the Manipulation of General Subdivisions and the Computation of Voronoi Diagrams",
 // ACM Transactions on Graphics 4 (1985), section 9.
+#include "divide_and_conquer.hpp"
+
 #include <algorithm>
 #include <numeric>
 #include <utility>
 #include <vector>
-
-#include "tensor_stereo/triangulation.hpp"
 
 namespace tensor_stereo {
 namespace {
@@ -15,7 +15,7 @@ class Rings {
    public:
     explicit Rings(const Triangulation& mesh) : points_(mesh.points.data()), bounds_(mesh.bounds) {
         const std::size_t half_edges = 8 * mesh.points.size();
-        origin.reserve(half_edges), after.reserve(half_edges), before.reserve(half_edges);
+        for (auto* const values : {&origin, &after, &before}) values->reserve(half_edges);
     }
 
     std::vector<Index> origin, after, before;
@@ -61,12 +61,13 @@ class Rings {
         Index edge;
         if (free_.empty()) {
             edge = static_cast<Index>(origin.size());
-            origin.resize(edge + 2), after.resize(edge + 2), before.resize(edge + 2);
+            for (auto* const values : {&origin, &after, &before}) values->resize(edge + 2);
         } else {
             edge = free_.back();
             free_.pop_back();
         }
-        origin[edge] = from, origin[edge ^ 1] = to;
+        origin[edge] = from;
+        origin[edge ^ 1] = to;
         after[edge] = before[edge] = edge;
         after[edge ^ 1] = before[edge ^ 1] = edge ^ 1;
         return edge;
@@ -161,14 +162,15 @@ void divide_and_conquer(Triangulation& result) {
     Rings rings(result);
     rings.build(0, count);
     const auto half_edges = static_cast<Index>(rings.origin.size());
-    std::vector<Index> corner(half_edges, kNone);  // half-edge of the triangulation that a half-edge of the rings becomes
+    std::vector<Index> corner(half_edges, kNone);  // the half-edge of the result that one of the rings becomes
     result.origin.clear();
     for (Index e = 0; e < half_edges; ++e) {
         if (rings.origin[e] == kNone || corner[e] != kNone) continue;
         const Index f = rings.left_next(e), g = rings.left_next(f);
         if (rings.left_next(g) != e) continue;
         const Index a = rings.origin[e], b = rings.origin[f], c = rings.origin[g];
-        if (orientation(result.points[a], result.points[b], result.points[c], result.bounds) <= 0) continue;  // the outer face
+        const int turn = orientation(result.points[a], result.points[b], result.points[c], result.bounds);
+        if (turn <= 0) continue;  // the outer face
         for (const Index h : {e, f, g}) {
             corner[h] = static_cast<Index>(result.origin.size());
             result.origin.push_back(rings.origin[h]);

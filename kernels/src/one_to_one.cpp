@@ -2,17 +2,15 @@
 
 #include <algorithm>
 #include <bit>
-#include <cmath>
 #include <cstddef>
 #include <numeric>
 #include <vector>
 
+#include "tensor_stereo/index.hpp"
 #include "tensor_stereo/parallel.hpp"
 
 namespace tensor_stereo {
 namespace {
-
-using Index = std::int32_t;
 
 // Labels the points of one segment by the first row of equal coordinates.
 class Labels {
@@ -52,30 +50,11 @@ class Labels {
 
 }  // namespace
 
-std::int64_t first_point_out_of_range(const double* points, std::int64_t num_points) noexcept {
-    const auto is_bad = [](double value) {
-        const double magnitude = std::fabs(value);
-        return !(magnitude == 0 || (magnitude >= 1e-60 && magnitude <= 1e60));
-    };
-    constexpr std::int64_t kBlock = 1024;
-    for (std::int64_t begin = 0; begin < 2 * num_points; begin += kBlock) {
-        const std::int64_t end = std::min(begin + kBlock, 2 * num_points);
-        bool any = false;
-        for (std::int64_t k = begin; k < end; ++k) any |= is_bad(points[k]);
-        if (!any) continue;
-        for (std::int64_t k = begin; k < end; ++k) {
-            if (is_bad(points[k])) return k / 2;
-        }
-    }
-    return -1;
-}
-
 void one_to_one(const double* points0, const double* points1, const std::int64_t* ptr, std::int64_t num_pairs,
                 const double* cost, int num_threads, bool* kept) {
     parallel_for(num_pairs, 1, num_threads, [&] {
-        return [&, labels0 = Labels(), labels1 = Labels(), order = std::vector<Index>(),
-                taken0 = std::vector<bool>(), taken1 = std::vector<bool>()](std::int64_t begin,
-                                                                            std::int64_t end) mutable {
+        return [&, labels0 = Labels(), labels1 = Labels(), order = std::vector<Index>(), taken0 = std::vector<bool>(),
+                taken1 = std::vector<bool>()](std::int64_t begin, std::int64_t end) mutable {
             for (std::int64_t b = begin; b < end; ++b) {
                 const std::int64_t start = ptr[b];
                 const auto count = static_cast<std::size_t>(ptr[b + 1] - start);

@@ -66,7 +66,6 @@ struct Expansion {
         size = kept;
     }
 
-
     template <std::size_t kA, std::size_t kB>
     void add_product(const Expansion<kA>& a, const Expansion<kB>& b) noexcept {
         for (std::size_t i = 0; i < a.size; ++i) {

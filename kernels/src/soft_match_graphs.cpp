@@ -2,19 +2,20 @@
 
 #include <algorithm>
 #include <array>
-#include <limits>
-#include <utility>
+#include <vector>
 
+#include "segment_graph.hpp"
 #include "tensor_stereo/critical_points.hpp"
+#include "tensor_stereo/index.hpp"
 #include "tensor_stereo/parallel.hpp"
-#include "tensor_stereo/segment_graph.hpp"
 
 namespace tensor_stereo {
 namespace {
 
-// Calls visit(i, j, critical) for the edges of the exact graph and the crossing pairs of their critical points, and
-// visit(i, j, nullptr) for pairs whose critical points must be searched, among them the chords of co-circular polygons.
-class PairCollector {
+// Calls visit(i, j, critical) for the edges of the exact graph and for the links of their critical points that cross
+// them, and visit(i, j, nullptr) for links whose critical points must be searched, among them the chords of co-circular
+// polygons.
+class LinkCollector {
    public:
     static constexpr std::size_t kMostCorners = 16;  // the chords of larger polygons are not listed: there are too many
 
@@ -77,50 +78,50 @@ class PairCollector {
     std::vector<Index> polygon_, stack_;
 };
 
-struct FoundPair {
+struct FoundLink {
     Index i, j;
     Critical view[2];
 };
 
 // Both views of one segment after the other.
-class PairFinder {
+class LinkFinder {
    public:
-    PairFinder(const double* points0, const double* points1, double tie_tolerance, Reach reach)
+    LinkFinder(const double* points0, const double* points1, double tie_tolerance, Reach reach)
         : graph_{SegmentGraph(points0, tie_tolerance), SegmentGraph(points1, tie_tolerance)},
           critical_{CriticalPoints(reach), CriticalPoints(reach)} {}
 
     void build(const std::int64_t* index, std::size_t count, const std::array<Index*, 2>& degree,
-               const std::array<Index*, 2>& neighbors, std::vector<FoundPair>& found) {
+               const std::array<Index*, 2>& neighbors, std::vector<FoundLink>& found) {
         found.clear();
         if (count == 0) return;
         first_.assign(count + 1, 0);
-        pairs_.clear();
+        links_.clear();
         for (int v = 0; v < 2; ++v) {
             graph_[v].build(index, count, degree[v], neighbors[v]);
             critical_[v].prepare(graph_[v].mesh(), graph_[v].edges());
-            collector_.collect(graph_[v].mesh(), graph_[v].edges(), critical_[v],
-                               [this, v](Index i, Index j, const Critical* known) {
-                const Critical critical = known != nullptr ? *known : Critical{kUnknown, kUnknown, false};
-                pairs_.push_back(i < j ? CollectedPair{i, j, v, critical} : CollectedPair{j, i, v, critical.reversed()});
-                ++first_[pairs_.back().i + 1];
-            });
+            const auto add = [this, v](Index i, Index j, const Critical* known) {
+                const Critical found = known != nullptr ? *known : Critical{kUnknown, kUnknown, false};
+                links_.push_back(i < j ? CollectedLink{i, j, v, found} : CollectedLink{j, i, v, found.reversed()});
+                ++first_[links_.back().i + 1];
+            };
+            collector_.collect(graph_[v].mesh(), graph_[v].edges(), critical_[v], add);
         }
         for (std::size_t i = 0; i < count; ++i) first_[i + 1] += first_[i];
-        sorted_.resize(pairs_.size());
+        sorted_.resize(links_.size());
         position_.assign(first_.begin(), first_.end() - 1);
-        for (const CollectedPair& pair : pairs_) sorted_[position_[pair.i]++] = pair;
+        for (const CollectedLink& link : links_) sorted_[position_[link.i]++] = link;
         for (std::size_t i = 0; i < count; ++i) {
             const auto begin = sorted_.begin() + first_[i], end = sorted_.begin() + first_[i + 1];
-            std::sort(begin, end, [](const CollectedPair& a, const CollectedPair& b) { return a.j < b.j; });
+            std::sort(begin, end, [](const CollectedLink& a, const CollectedLink& b) { return a.j < b.j; });
             for (auto k = begin; k != end;) {
-                FoundPair pair{k->i, k->j, {{kUnknown, kUnknown, false}, {kUnknown, kUnknown, false}}};
-                for (; k != end && k->j == pair.j; ++k) {
-                    if (k->critical.left != kUnknown) pair.view[k->view] = k->critical;
+                FoundLink link{k->i, k->j, {{kUnknown, kUnknown, false}, {kUnknown, kUnknown, false}}};
+                for (; k != end && k->j == link.j; ++k) {
+                    if (k->critical.left != kUnknown) link.view[k->view] = k->critical;
                 }
                 for (int v = 0; v < 2; ++v) {
-                    if (pair.view[v].left == kUnknown) pair.view[v] = critical_[v].find(pair.i, pair.j);
+                    if (link.view[v].left == kUnknown) link.view[v] = critical_[v].find(link.i, link.j);
                 }
-                found.push_back(pair);
+                found.push_back(link);
             }
         }
     }
@@ -128,7 +129,7 @@ class PairFinder {
    private:
     static constexpr Index kUnknown = -3;
 
-    struct CollectedPair {
+    struct CollectedLink {
         Index i, j;  // i < j
         int view;
         Critical critical;
@@ -136,12 +137,10 @@ class PairFinder {
 
     SegmentGraph graph_[2];
     CriticalPoints critical_[2];
-    PairCollector collector_;
-    std::vector<CollectedPair> pairs_, sorted_;
+    LinkCollector collector_;
+    std::vector<CollectedLink> links_, sorted_;
     std::vector<Index> first_, position_;
 };
-
-inline std::int64_t to_row(const std::int64_t* index, Index v) noexcept { return v < 0 ? v : index[v]; }
 
 }  // namespace
 
@@ -149,9 +148,9 @@ SoftMatchGraphs soft_match_graphs(const double* points0, const double* points1, 
                                   const std::int64_t* index, const std::int64_t* ptr, std::int64_t num_segments,
                                   double tie_tolerance, Reach reach, int num_threads) {
     const SegmentRows rows[2] = {SegmentRows(ptr[num_segments]), SegmentRows(ptr[num_segments])};
-    std::vector<std::vector<FoundPair>> found(num_segments);
+    std::vector<std::vector<FoundLink>> found(num_segments);
     parallel_for(num_segments, 1, num_threads, [&] {
-        return [&, finder = PairFinder(points0, points1, tie_tolerance, reach), buffer = std::vector<FoundPair>()](
+        return [&, finder = LinkFinder(points0, points1, tie_tolerance, reach), buffer = std::vector<FoundLink>()](
                    std::int64_t begin, std::int64_t end) mutable {
             for (std::int64_t s = begin; s < end; ++s) {
                 const std::int64_t start = ptr[s];
@@ -166,60 +165,32 @@ SoftMatchGraphs soft_match_graphs(const double* points0, const double* points1, 
     for (int v = 0; v < 2; ++v) {
         result.graph[v] = assemble(rows[v], num_points, index, ptr, num_segments, num_threads);
     }
-    result.pair_ptr = allocate<std::int64_t>(num_segments + 1);
-    std::int64_t* const offset = result.pair_ptr.get();
+    result.link_ptr = allocate<std::int64_t>(num_segments + 1);
+    std::int64_t* const offset = result.link_ptr.get();
     offset[0] = 0;
-    for (std::int64_t s = 0; s < num_segments; ++s) offset[s + 1] = offset[s] + static_cast<std::int64_t>(found[s].size());
-    result.num_pairs = offset[num_segments];
-    result.pairs = allocate<std::int64_t>(2 * result.num_pairs);
+    for (std::int64_t s = 0; s < num_segments; ++s) {
+        offset[s + 1] = offset[s] + static_cast<std::int64_t>(found[s].size());
+    }
+    result.num_links = offset[num_segments];
+    result.links = allocate<std::int64_t>(2 * result.num_links);
     for (auto& view : result.view) {
-        view.critical = allocate<std::int64_t>(2 * result.num_pairs);
-        view.is_edge = allocate<bool>(result.num_pairs);
+        view.critical = allocate<std::int64_t>(2 * result.num_links);
+        view.is_edge = allocate<bool>(result.num_links);
     }
     parallel_for(num_segments, 1, num_threads, [&] {
         return [&](std::int64_t begin, std::int64_t end) {
             for (std::int64_t s = begin; s < end; ++s) {
                 const std::int64_t* const members = index + ptr[s];
                 std::int64_t k = offset[s];
-                for (const FoundPair& pair : found[s]) {
-                    result.pairs[2 * k] = members[pair.i];
-                    result.pairs[2 * k + 1] = members[pair.j];
+                for (const FoundLink& link : found[s]) {
+                    result.links[2 * k] = members[link.i];
+                    result.links[2 * k + 1] = members[link.j];
                     for (int v = 0; v < 2; ++v) {
-                        result.view[v].critical[2 * k] = to_row(members, pair.view[v].right);
-                        result.view[v].critical[2 * k + 1] = to_row(members, pair.view[v].left);
-                        result.view[v].is_edge[k] = pair.view[v].is_edge;
+                        result.view[v].critical[2 * k] = to_row(members, link.view[v].right);
+                        result.view[v].critical[2 * k + 1] = to_row(members, link.view[v].left);
+                        result.view[v].is_edge[k] = link.view[v].is_edge;
                     }
                     ++k;
-                }
-            }
-        };
-    });
-    return result;
-}
-
-Buffer<std::int64_t> dual_critical_points(const double* points, const std::int64_t* index, const std::int64_t* ptr,
-                                          std::int64_t num_segments, const std::int64_t* pairs,
-                                          const std::int64_t* pair_ptr, int num_threads) {
-    constexpr double kInfinity = std::numeric_limits<double>::infinity();
-    auto result = allocate<std::int64_t>(2 * pair_ptr[num_segments]);
-    parallel_for(num_segments, 1, num_threads, [&] {
-        return [&, graph = SegmentGraph(points, 0), critical = CriticalPoints({kInfinity, 0}), degree = std::vector<Index>(),
-                neighbors = std::vector<Index>()](std::int64_t begin, std::int64_t end) mutable {
-            for (std::int64_t s = begin; s < end; ++s) {
-                if (pair_ptr[s] == pair_ptr[s + 1]) continue;
-                const std::int64_t* const members = index + ptr[s];
-                const auto count = static_cast<std::size_t>(ptr[s + 1] - ptr[s]);
-                degree.resize(count);
-                neighbors.resize(6 * count);
-                graph.build(members, count, degree.data(), neighbors.data());
-                critical.prepare(graph.mesh(), graph.edges());
-                const auto number = [&](std::int64_t row) {
-                    return static_cast<Index>(std::lower_bound(members, members + count, row) - members);
-                };
-                for (std::int64_t k = pair_ptr[s]; k < pair_ptr[s + 1]; ++k) {
-                    const Critical found = critical.find(number(pairs[2 * k]), number(pairs[2 * k + 1]));
-                    result[2 * k] = to_row(members, found.right);
-                    result[2 * k + 1] = to_row(members, found.left);
                 }
             }
         };

@@ -1,12 +1,12 @@
 // Radial sweep (Sinclair, "S-hull", 2016) with the flips of a new point done at once: the triangles that have it inside
 // their circles are carved out of the mesh (Bowyer, The Computer Journal 24 (1981)) and the hole is filled around it.
+#include "sweep_hull.hpp"
+
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <limits>
 #include <numeric>
-
-#include "tensor_stereo/triangulation.hpp"
+#include <vector>
 
 namespace tensor_stereo {
 namespace {
@@ -26,7 +26,10 @@ inline double pseudo_angle(double dx, double dy) noexcept {
 class SweepHull {
    public:
     SweepHull(Triangulation& mesh, Workspace& workspace)
-        : mesh_(mesh), space_(workspace), points_(mesh.points.data()), bounds_(mesh.bounds),
+        : mesh_(mesh),
+          space_(workspace),
+          points_(mesh.points.data()),
+          bounds_(mesh.bounds),
           count_(static_cast<Index>(mesh.points.size())) {}
 
     // False if the sweep must be given up.
@@ -95,14 +98,14 @@ class SweepHull {
             Triangle& triangle = triangles_[t];
             triangle.origin = {line[k], line[k + 1], apex};
             set_plane(triangle, from(apex, line[k + 1]), from(apex, line[k]), lifted_[apex]);
-            link(4 * t, kNone);
-            link(4 * t + 1, kNone);
-            link(4 * t + 2, shared);
+            join(4 * t, kNone);
+            join(4 * t + 1, kNone);
+            join(4 * t + 2, shared);
             shared = 4 * t + 1;
-            link_hull(line[k], line[k + 1]);
+            join_hull(line[k], line[k + 1]);
         }
-        link_hull(line.back(), apex);
-        link_hull(apex, line.front());
+        join_hull(line.back(), apex);
+        join_hull(apex, line.front());
         for (const Index v : line) space_.hull_hash[bucket(v)] = v;
         space_.hull_hash[bucket(apex)] = apex;
         start_ = apex;
@@ -126,8 +129,8 @@ class SweepHull {
             while (sees(point, hull_[first].previous, first)) first = hull_[first].previous;
         }
 
-        // Every triangle of the cavity hangs on one visible hull edge, so its rim from first to last comes in order, and
-        // what was read can be overwritten.
+        // Every triangle of the cavity hangs on one visible hull edge, so its rim from first to last comes in order,
+        // and what was read can be overwritten.
         Hole* const stack = space_.stack.data();
         Index* const free = space_.free.data();
         Index num_free = 0, before = kNone;  // before: half-edge from p in the triangle filled last
@@ -151,8 +154,8 @@ class SweepHull {
                 Triangle& triangle = triangles_[t];
                 triangle.origin = {origin, p, end};
                 set_plane(triangle, u, w, lifted);
-                link(4 * t, before);
-                link(4 * t + 2, beyond);
+                join(4 * t, before);
+                join(4 * t + 2, beyond);
                 before = 4 * t + 1;
                 u = w;
                 if (depth == 0) break;
@@ -165,9 +168,9 @@ class SweepHull {
             }
             v = stop;
         }
-        link(before, kNone);
-        link_hull(first, p);
-        link_hull(p, last);
+        join(before, kNone);
+        join_hull(first, p);
+        join_hull(p, last);
         start_ = first;
         space_.hull_hash[key] = p;
         space_.hull_hash[bucket(first)] = first;
@@ -213,7 +216,7 @@ class SweepHull {
         return orientation(points_[e], points_[q], point, bounds_) < 0;
     }
 
-    void link_hull(Index v, Index w) noexcept {
+    void join_hull(Index v, Index w) noexcept {
         hull_[v].next = w;
         hull_[w].previous = v;
     }
@@ -244,7 +247,7 @@ class SweepHull {
         return incircle(points_[v[0]], points_[v[1]], points_[v[2]], point, bounds_) > 0;
     }
 
-    void link(Index h, Index twin) noexcept {
+    void join(Index h, Index twin) noexcept {
         triangles_[h >> 2].twin[h & 3] = twin;
         if (twin != kNone) {
             triangles_[twin >> 2].twin[twin & 3] = h;

@@ -8,11 +8,16 @@
 #include <numeric>
 #include <utility>
 
+#include "divide_and_conquer.hpp"
+#include "sweep_hull.hpp"
+
 namespace tensor_stereo {
 namespace {
 
 // Positive floats order as their bits do.
-inline std::uint32_t order_bits(double value) noexcept { return std::bit_cast<std::uint32_t>(static_cast<float>(value)); }
+inline std::uint32_t order_bits(double value) noexcept {
+    return std::bit_cast<std::uint32_t>(static_cast<float>(value));
+}
 
 // Sorts by the squared distance from the centre of the bounding box: each point lies outside the hull of those before
 // it, but for rounding. Radix passes order by the distance as a float, insertion repairs what that rounds together.
@@ -21,8 +26,10 @@ void sort_radially(const double* points, const std::int64_t* index, std::size_t 
     double min_x = std::numeric_limits<double>::infinity(), min_y = min_x, max_x = -min_x, max_y = -min_x;
     for (std::size_t k = 0; k < count; ++k) {
         const double x = points[2 * index[k]], y = points[2 * index[k] + 1];
-        min_x = std::min(min_x, x), max_x = std::max(max_x, x);
-        min_y = std::min(min_y, y), max_y = std::max(max_y, y);
+        min_x = std::min(min_x, x);
+        max_x = std::max(max_x, x);
+        min_y = std::min(min_y, y);
+        max_y = std::max(max_y, y);
     }
     const Point centre{min_x + (max_x - min_x) / 2, min_y + (max_y - min_y) / 2};
     result.box = {{min_x, min_y}, centre, std::max(max_x - min_x, max_y - min_y)};
@@ -58,7 +65,10 @@ void sort_radially(const double* points, const std::int64_t* index, std::size_t 
         const Radial item{dx * dx + dy * dy, row};
         std::size_t hole = k;
         if (shifts <= 8 * count) {
-            for (; hole > 0 && order[hole - 1].distance > item.distance; --hole, ++shifts) order[hole] = order[hole - 1];
+            for (; hole > 0 && order[hole - 1].distance > item.distance; --hole) {
+                order[hole] = order[hole - 1];
+                ++shifts;
+            }
         }
         order[hole] = item;
     }

@@ -1,5 +1,5 @@
-// libFuzzer target: for any bytes the graph is symmetric and shrinks with the tolerance, divide and conquer makes as many
-// triangles as the sweep, and small integers give the graph of the circle definition.
+// libFuzzer target: for any bytes the graph is symmetric and shrinks with the tolerance, divide and conquer makes as
+// many triangles as the sweep, and small integers give the graph of the circle definition.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -7,7 +7,10 @@
 #include <cstring>
 #include <vector>
 
+#include "divide_and_conquer.hpp"
+#include "sweep_hull.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
+#include "tensor_stereo/first_point_out_of_range.hpp"
 #include "tensor_stereo/one_to_one.hpp"
 #include "tensor_stereo/triangulation.hpp"
 
@@ -16,8 +19,10 @@ namespace ts = tensor_stereo;
 namespace {
 
 // Whether a circle through points i and j has every other point strictly outside, in exact integers (|x|, |y| <= 16).
-bool is_edge(const std::vector<double>& values, const std::vector<std::int64_t>& index, std::int64_t i, std::int64_t j) {
-    const auto x = [&](std::int64_t k) { return 2 * static_cast<std::int64_t>(values[2 * k]); };  // midpoints are integers
+bool is_edge(const std::vector<double>& values, const std::vector<std::int64_t>& index, std::int64_t i,
+             std::int64_t j) {
+    // Doubled, so that midpoints are integers.
+    const auto x = [&](std::int64_t k) { return 2 * static_cast<std::int64_t>(values[2 * k]); };
     const auto y = [&](std::int64_t k) { return 2 * static_cast<std::int64_t>(values[2 * k + 1]); };
     const std::int64_t mx = (x(i) + x(j)) / 2, my = (y(i) + y(j)) / 2, nx = y(i) - y(j), ny = x(j) - x(i);
     const std::int64_t radius = (x(i) - mx) * (x(i) - mx) + (y(i) - my) * (y(i) - my);
@@ -29,8 +34,16 @@ bool is_edge(const std::vector<double>& values, const std::vector<std::int64_t>&
         const std::int64_t a = 2 * (nx * (mx - x(k)) + ny * (my - y(k)));
         const std::int64_t b = (mx - x(k)) * (mx - x(k)) + (my - y(k)) * (my - y(k)) - radius;
         if (a == 0 && b <= 0) return false;
-        if (a > 0 && (!has_low || -b * low_by > low * a)) has_low = true, low = -b, low_by = a;
-        if (a < 0 && (!has_high || b * high_by < high * -a)) has_high = true, high = b, high_by = -a;
+        if (a > 0 && (!has_low || -b * low_by > low * a)) {
+            has_low = true;
+            low = -b;
+            low_by = a;
+        }
+        if (a < 0 && (!has_high || b * high_by < high * -a)) {
+            has_high = true;
+            high = b;
+            high_by = -a;
+        }
     }
     return !has_low || !has_high || low * high_by < high * low_by;
 }

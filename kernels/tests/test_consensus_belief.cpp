@@ -1,10 +1,12 @@
-// Laws of the consensus of matches.
+#include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <numeric>
 #include <random>
 #include <vector>
 
 #include "expect.hpp"
+#include "plain_consensus_belief.hpp"
 #include "tensor_stereo/consensus_belief.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
 
@@ -30,7 +32,8 @@ struct ConsensusSample {
         ptr.push_back(static_cast<std::int64_t>(cost.size()));
     }
 
-    std::vector<double> belief(const ts::ConsensusSettings& settings, int num_threads) const {
+    std::vector<double> belief(const ts::ConsensusSettings& settings, int num_threads,
+                               decltype(ts::consensus_belief)& kernel = ts::consensus_belief) const {
         const auto count = static_cast<std::int64_t>(cost.size());
         const auto num_pairs = static_cast<std::int64_t>(ptr.size()) - 1;
         std::vector<std::int64_t> index(cost.size());
@@ -40,20 +43,20 @@ struct ConsensusSample {
         };
         const auto graph0 = build(keypoints[0]), graph1 = build(keypoints[1]);
         std::vector<double> result(cost.size(), -1);
-        ts::consensus_belief({{keypoints[0].data(), keypoints[1].data()},
-                              ptr.data(),
-                              num_pairs,
-                              cost.data(),
-                              {graph0.crow.get(), graph1.crow.get()},
-                              {graph0.cols.get(), graph1.cols.get()}},
-                             settings, num_threads, result.data());
+        kernel({{keypoints[0].data(), keypoints[1].data()},
+                ptr.data(),
+                num_pairs,
+                cost.data(),
+                {graph0.crow.get(), graph1.crow.get()},
+                {graph0.cols.get(), graph1.cols.get()}},
+               settings, num_threads, result.data());
         return result;
     }
 };
 
 }  // namespace
 
-void test_consensus_believes_matches_that_agree() {
+TEST(consensus_believes_matches_that_agree) {
     std::mt19937_64 rng(7);
     ConsensusSample sample;
     sample.add_pair(rng, 300, 10);
@@ -70,7 +73,7 @@ void test_consensus_believes_matches_that_agree() {
     }
 }
 
-void test_consensus_without_neighbours_is_zero() {
+TEST(consensus_without_neighbours_is_zero) {
     std::mt19937_64 rng(8);
     ConsensusSample sample;
     EXPECT(sample.belief(kSettings, 2).empty());
@@ -83,7 +86,7 @@ void test_consensus_without_neighbours_is_zero() {
     for (const double belief : sample.belief(settings, 2)) EXPECT(belief == 0.5);
 }
 
-void test_consensus_does_not_depend_on_threads_or_batches() {
+TEST(consensus_does_not_depend_on_threads_or_batches) {
     std::mt19937_64 rng(9);
     ConsensusSample sample;
     for (const int count : {5000, 0, 1, 2, 700}) sample.add_pair(rng, count, 3);
@@ -99,5 +102,23 @@ void test_consensus_does_not_depend_on_threads_or_batches() {
         single.cost.assign(sample.cost.begin() + begin, sample.cost.begin() + end);
         single.ptr.push_back(end - begin);
         EXPECT(single.belief(kSettings, 1) == std::vector<double>(one.begin() + begin, one.begin() + end));
+    }
+}
+
+TEST(vector_types_and_plain_numbers_give_the_same_bits) {
+    std::mt19937_64 rng(12);
+    for (const int num_rounds : {1, 2, 5}) {
+        for (const bool has_rows : {false, true}) {
+            ConsensusSample sample;
+            for (const int count : {0, 1, 2, 3, 40, 700, 3000}) sample.add_pair(rng, count, 4);
+            auto settings = kSettings;
+            settings.num_rounds = num_rounds;
+            if (!has_rows) settings.row_tolerance.reset();
+            const auto own = sample.belief(settings, 1);
+            const auto plain = sample.belief(settings, 1, ts::plain_consensus_belief);
+            for (std::size_t k = 0; k < own.size(); ++k) {
+                EXPECT(std::memcmp(&own[k], &plain[k], sizeof(double)) == 0);
+            }
+        }
     }
 }

@@ -8,8 +8,8 @@ namespace tensor_stereo {
 
 // A batch of pairs and the graphs of both views over its matches.
 struct ConsensusMatches {
-    const double* keypoints[2];   // (ptr[num_pairs], 2) px
-    const std::int64_t* ptr;      // (num_pairs + 1) offsets
+    const double* keypoints[2];  // (ptr[num_pairs], 2) px
+    const std::int64_t* ptr;     // (num_pairs + 1) offsets
     std::int64_t num_pairs;
     const double* cost;           // one per match, or null
     const std::int64_t* crow[2];  // one more than matches; offsets

@@ -1,4 +1,4 @@
-// The points that bound the dual Voronoi edge of a pair of points.
+// The points that bound the dual Voronoi edge of a link.
 #pragma once
 
 #include <cmath>
@@ -6,13 +6,15 @@
 #include <vector>
 
 #include "tensor_stereo/graph_edges.hpp"
+#include "tensor_stereo/index.hpp"
+#include "tensor_stereo/predicates.hpp"
 #include "tensor_stereo/triangulation.hpp"
 
 namespace tensor_stereo {
 
 inline constexpr Index kBlocked = -2;
 
-// How negative a signed dual length may get before the pair counts as blocked: the sum of both parts.
+// How negative a signed dual length may get before the link counts as blocked: the sum of both parts.
 struct Reach {
     double edge_lengths, px;
 };
@@ -41,9 +43,9 @@ struct Critical {
     Critical reversed() const noexcept { return {left, right, is_edge}; }
 };
 
-inline constexpr Critical kBlockedPair{kBlocked, kBlocked, false};
+inline constexpr Critical kBlockedLink{kBlocked, kBlocked, false};
 
-// Finds them for pairs of points of one segment. If {i, j} is an edge of the mesh they are its opposite vertices;
+// Finds them for links between points of one segment. If {i, j} is an edge of the mesh they are its opposite vertices;
 // otherwise they are among the vertices of the triangles that the segment from i to j crosses, since the constrained
 // Delaunay triangulation with that segment only changes these (Anglada, Computers & Graphics 21 (1997), section 3).
 class CriticalPoints {
@@ -62,11 +64,11 @@ class CriticalPoints {
     // The same, blocked if out of reach; rounding can do that to an edge between needles.
     Critical in_reach(Index h, Critical found) const noexcept;
 
-    // Whether the critical points of an edge of the exact graph, right and left of its half-edge h, see each other across
-    // it: they are the pair that takes its place when it vanishes.
+    // Whether the critical points of an edge of the exact graph, right and left of its half-edge h, see each other
+    // across it: the link between them takes its place when it vanishes.
     bool cross(Index h, const Critical& found) const noexcept;
 
-    // The critical points of that pair, seen from right to left, if it is plain that they are the ends of the edge.
+    // The critical points of that link, seen from right to left, if it is plain that they are the ends of the edge.
     bool across(Index h, Critical& found) const noexcept;
 
    private:
@@ -79,19 +81,19 @@ class CriticalPoints {
 
     // The vertices on one side of a way through the mesh.
     struct Chain {
-        struct Link {
+        struct Corner {
             Index vertex, beyond;  // and the half-edge outside the chain's edge that leads to it
         };
 
         void start(Index vertex, Index beyond, const End& end) {
-            links.clear();
+            corners.clear();
             best = 0;
             best_end = end;
             any_tie = false;
-            links.push_back({vertex, beyond});
+            corners.push_back({vertex, beyond});
         }
 
-        std::vector<Link> links;
+        std::vector<Corner> corners;
         std::size_t best;  // sees the segment under the largest angle
         End best_end;      // its dual end
         bool any_tie;      // others are as good
@@ -120,7 +122,7 @@ class CriticalPoints {
     Reach reach_;
     const Triangulation* mesh_ = nullptr;
     const GraphEdges* edges_ = nullptr;
-    std::vector<Index> fan_;   // of each vertex the half-edge from it that comes first counter-clockwise
+    std::vector<Index> fan_;  // of each vertex the half-edge from it that comes first counter-clockwise
     std::vector<Index> degree_;
     std::vector<Index> rank_;  // number in the mesh of each vertex of the input
     Chain left_, right_;

@@ -20,11 +20,11 @@ struct Gate {
 
 // What each keypoint found. Ties go to the lowest index. Without a candidate the index is -1 and the cost infinite.
 struct Neighbors {
-    float* cost;            // (N0)
-    std::int64_t* index;    // (N0) global row in view 1
-    float* second_cost;     // (N0) of the second-best candidate
-    float* cost1;           // (N1) the same seen from view 1
-    std::int64_t* index1;   // (N1)
+    float* cost;           // (N0)
+    std::int64_t* index;   // (N0) global row in view 1
+    float* second_cost;    // (N0) of the second-best candidate
+    float* cost1;          // (N1) the same seen from view 1
+    std::int64_t* index1;  // (N1)
 };
 
 // The sum runs in 16 interleaved lanes, each in order, which are then added in halves: the same bits as the reference.

@@ -52,7 +52,7 @@ class GraphEdges {
         }
     }
 
-    // kLong: an edge of the graph; kShort: one of the exact graph alone; kTie: of neither, its triangles are co-circular.
+    // kLong: an edge of the graph; kShort: of the exact graph alone; kTie: of neither, its triangles are co-circular.
     State state(Index h) const noexcept { return state_[h]; }
 
     // Calls visit(i, j) for both directions of each of them, vertices in the mesh's own order.
@@ -82,7 +82,8 @@ class GraphEdges {
         return incircle(a, b, c, d, mesh.bounds);
     }
 
-    // Signed distance of the circle's centre from the midpoint of {i, j} towards k, in edge lengths: cot(angle at k) / 2.
+    // Signed distance of the circle's centre from the midpoint of {i, j} towards k, in edge lengths: half the cotangent
+    // of the angle at k.
     double end_of_dual(double dot, double cross) const noexcept {
         return std::min(std::max(0.5 * dot / std::fabs(cross), -bound_), bound_);
     }
@@ -115,8 +116,9 @@ class GraphEdges {
         }
     }
 
-    // A co-circular polygon may be cut in many ways, and its vertices give the same circle but for rounding. So that the
-    // result depends on the points alone, its edges are measured from its lexicographically first vertex not on them.
+    // A co-circular polygon may be cut in many ways, and its vertices give the same circle but for rounding. So that
+    // the result depends on the points alone, its edges are measured from its lexicographically first vertex not on
+    // them.
     void settle_ties(const Triangulation& mesh) {
         const auto half_edges = static_cast<Index>(mesh.origin.size());
         polygon_.resize(half_edges / 3);

@@ -24,8 +24,8 @@ int exact_incircle(Point a, Point b, Point c, Point d) noexcept;
 inline int sign(double value) noexcept { return (value > 0) - (value < 0); }
 
 // Bounds on the rounding of the determinants that hold for all points within a square of the given side; 0 where plain
-// double arithmetic does not round at all. The plane is that of the in-circle test on the paraboloid, by coordinates from
-// the centre of the square.
+// double arithmetic does not round at all. The plane is that of the in-circle test on the paraboloid, by coordinates
+// from the centre of the square.
 struct Bounds {
     double orientation = 0, incircle = 0, plane = 0;
 
@@ -33,7 +33,8 @@ struct Bounds {
         // |left| + |right| <= 2 side^2; each of the three terms of the permanent is at most 2 side^2 * 2 side^2; the
         // terms of the plane are at most 96 (side / 2)^4 in all, and no product or sum goes through 16 roundings.
         const double square = side * side;
-        return {2.01 * kOrientationBound * square, 12.01 * kIncircleBound * square * square, 100 * kEpsilon * square * square};
+        return {2.01 * kOrientationBound * square, 12.01 * kIncircleBound * square * square,
+                100 * kEpsilon * square * square};
     }
 };
 

@@ -6,9 +6,11 @@
 #include <cstdint>
 #include <vector>
 
+#include "sweep_hull.hpp"
 #include "tensor_stereo/buffer.hpp"
 #include "tensor_stereo/delaunay_graph.hpp"
 #include "tensor_stereo/graph_edges.hpp"
+#include "tensor_stereo/index.hpp"
 #include "tensor_stereo/triangulation.hpp"
 
 namespace tensor_stereo {
@@ -65,14 +67,17 @@ class SegmentGraph {
     std::vector<Index> start_, position_, unsorted_;
 };
 
-// What the segments of a batch write side by side: 6 places for the neighbours of each vertex, because a planar graph has
-// fewer; neighbours are numbered within the segment.
+// What the segments of a batch write side by side: 6 places for the neighbours of each vertex, because a planar graph
+// has fewer; neighbours are numbered within the segment.
 struct SegmentRows {
     explicit SegmentRows(std::int64_t num_vertices)
         : degree(allocate<Index>(num_vertices)), neighbors(allocate<Index>(6 * num_vertices)) {}
 
     Buffer<Index> degree, neighbors;
 };
+
+// The row of vertex v of a segment; codes below zero stay as they are.
+inline std::int64_t to_row(const std::int64_t* members, Index v) noexcept { return v < 0 ? v : members[v]; }
 
 // One pattern over all points from the rows of its segments.
 SparsePattern assemble(const SegmentRows& rows, std::int64_t num_points, const std::int64_t* index,

@@ -34,6 +34,7 @@ check: format lint types imports test sanitize slow  ## All that CI runs
 
 format: $(READY)  ## Check the formatting
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'kernels/*.cpp' 'kernels/*.hpp')
 
 lint: $(READY)  ## Check style and docstrings
 	$(BIN)/ruff check .

@@ -7,12 +7,15 @@ import io
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, NoReturn
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Any
 
 import tyro
 
+from tensor_stereo.cli.checks import check
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.cli.endings import BAD_INPUT, INTERRUPTED, fail
+from tensor_stereo.cli.flags import name_flags
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -29,27 +32,39 @@ Command = (
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; bad input ends in one line on standard error and exit code 2."""
+    if list(sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        from tensor_stereo import __version__
+
+        print(f"tensor-stereo {__version__}")
+        return
     try:
         command = _parse(arguments)
     except ValueError as error:  # of the settings' own checks; tyro exits by itself
-        _fail(error)
-    # torch is needed from here on; a sweep that only looks at what is done needs neither reports nor figures
-    if isinstance(command, Sweep):
-        from tensor_stereo.cli.sweep import run_sweep_command as run
-    else:
-        from tensor_stereo.cli.runners import run
+        sys.exit(fail(_one_line(error), BAD_INPUT))
     from tensor_stereo.sweeps.journal import SweepError
 
     try:
+        check(command)
+        run = _runner(command)
         with _domain_warnings_in_one_line():
             code = run(command)
     except (ValueError, TypeError, ImportError, SweepError, OSError) as error:
-        _fail(error)
+        sys.exit(fail(_one_line(error), BAD_INPUT))
     except KeyboardInterrupt:
-        print("tensor-stereo: interrupted", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(fail("interrupted", INTERRUPTED))
     if code:
         sys.exit(code)
+
+
+def _runner(command: Any) -> Callable[[Any], int]:
+    """What carries out a command. torch is needed from here on; a sweep needs neither reports nor figures."""
+    if isinstance(command, Sweep):
+        from tensor_stereo.cli.sweep import run_sweep_command
+
+        return run_sweep_command
+    from tensor_stereo.cli.runners import run
+
+    return run
 
 
 def _parse(arguments: Sequence[str] | None) -> Any:
@@ -85,7 +100,7 @@ def _domain_warnings_in_one_line() -> Iterator[None]:
         kind = str(message).partition(", but")[0]
         if kind not in seen:
             seen.add(kind)
-            print(f"tensor-stereo: warning: {message}", file=sys.stderr)
+            fail(f"warning: {name_flags(str(message))}")
 
     warnings.showwarning = show_line  # type: ignore[assignment]
     try:
@@ -94,6 +109,5 @@ def _domain_warnings_in_one_line() -> Iterator[None]:
         warnings.showwarning = show
 
 
-def _fail(error: Exception) -> NoReturn:
-    print(f"tensor-stereo: {' '.join(str(error).split())}", file=sys.stderr)
-    sys.exit(2)
+def _one_line(error: Exception) -> str:
+    return name_flags(" ".join(str(error).split()))

@@ -1,81 +1,128 @@
-"""What each subcommand does: call the library, print."""
+"""What each subcommand does: call the library, print, say by the exit code how it ended."""
 
 from __future__ import annotations
 
+import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table as RichTable
 
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report
-from tensor_stereo.cli.download import run_download_command
+from tensor_stereo.cli.endings import OK, fail, most_frequent
+from tensor_stereo.cli.progress import show_progress, time_left
 from tensor_stereo.configs import EvaluationConfig
-from tensor_stereo.datasets import PairDataset, build_manifest, find_pairs, write_manifest
-from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset, write_synthetic
-from tensor_stereo.evaluation.dataset import PairEvaluation, evaluate_dataset
-from tensor_stereo.interop.match_files import filter_file
-from tensor_stereo.reports.evaluation import write_evaluation
-from tensor_stereo.reports.pair import classify_files
-from tensor_stereo.reports.sweep.report import write_report
-from tensor_stereo.reports.sweep.runs import load_run
-from tensor_stereo.reports.tables import Table, to_markdown
+
+# The library is imported where it is called: no command waits for what it does not use.
 
 
 def run(command: Any) -> int:
-    """Carry out a parsed command; its exit code."""
-    _RUNNERS[type(command)](command)
-    return 0
+    """Carry out a parsed command; its exit code: 0, or 1 if the result is not what was asked for."""
+    return _RUNNERS[type(command)](command)
 
 
-def _run_demo(command: Demo) -> None:
+def _run_demo(command: Demo) -> int:
+    from tensor_stereo.datasets.synthetic import SyntheticDataset
+    from tensor_stereo.reports.evaluation import write_evaluation
+
     dataset = SyntheticDataset(command.num_pairs, seed=command.seed)
     config = EvaluationConfig()
     source = {"dataset": "synthetic", "num_pairs": command.num_pairs, "seed": command.seed}
-    _print_tables(write_evaluation(_progress(dataset, config), config, source=source, out=command.out))
+    _print_tables(write_evaluation(_evaluate(dataset, config, {}), config, source=source, out=command.out))
     if command.out is None:
         print("Figures and summary.json are written with --out DIR.")
     else:
         print(f"Tables, summary.json and figures: {command.out}")
+    return OK
 
 
-def _run_evaluate(command: Evaluate) -> None:
+def _run_evaluate(command: Evaluate) -> int:
+    from tensor_stereo.datasets import PairDataset, find_pairs
+    from tensor_stereo.reports.evaluation import write_errors, write_evaluation
+
     config = command.config
     if command.preset == "paper":
         config = replace(config, sift=replace(config.sift, max_ratio=0.6))
-    files = find_pairs(command.root, scenes=command.scenes, gt_scale=command.gt_scale)
+    found = find_pairs(command.root, scenes=command.scenes, gt_scale=command.gt_scale)
+    files = [pair for pair in found if pair.disparity_gt is not None]
+    if not files:
+        return fail(f"none of the {len(found)} pairs below {command.root} has ground truth, which an evaluation needs")
+    if len(files) < len(found):
+        print(f"{len(found) - len(files)} of {len(found)} pairs have no ground truth and are left out", file=sys.stderr)
     source = {"root": str(command.root), "scenes": [f"{pair.dataset}/{pair.scene}" for pair in files]}
-    tables = write_evaluation(_progress(PairDataset(files), config), config, source=source, out=command.out)
-    _print_tables(tables)
+    errors: dict[str, str] = {}
+    results = _evaluate(PairDataset(files), config, errors)
+    tables = write_evaluation(results, config, source=source, out=command.out)
+    if len(errors) < len(files):
+        _print_tables(tables)
+    if errors:
+        if command.out is not None:
+            write_errors(errors, command.out)
+        return fail(f"{len(errors)} of {len(files)} pairs failed: {most_frequent(errors.values())}")
+    return OK
 
 
-def _run_index(command: Index) -> None:
+def _run_index(command: Index) -> int:
+    from tensor_stereo.datasets import build_manifest, write_manifest
+
     manifest = build_manifest(command.roots, gt_scale=command.gt_scale)
     write_manifest(manifest, command.out)
     for dataset, count in sorted(Counter(manifest["dataset"]).items()):
         print(f"{dataset}: {count} pairs")
     print(f"{len(manifest)} pairs in {command.out}")
+    return OK
 
 
-def _run_filter(command: Filter) -> None:
+def _run_filter(command: Filter) -> int:
+    from tensor_stereo.interop.match_files import filter_file
+
     summary = filter_file(command.matches, command.out, keypoints=command.keypoints, config=command.config)
-    for name, value in asdict(summary).items():
+    values = asdict(summary)
+    num_agreeing = values.pop("num_agreeing")
+    for name, value in values.items():
         print(f"{name:20}{value:8}")
+    return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)
 
 
-def _run_render(command: Render) -> None:
+def _run_download(command: Download) -> int:
+    from tensor_stereo.cli.download import run_download_command
+
+    run_download_command(command)
+    return OK
+
+
+def _run_render(command: Render) -> int:
+    from tensor_stereo.datasets.synthetic import write_synthetic
+
     print(write_synthetic(command.out, command.num_pairs, seed=command.seed))
+    return OK
 
 
-def _run_report(command: Report) -> None:
-    for path in write_report([load_run(run) for run in command.runs], command.out or command.runs[-1]):
+def _run_report(command: Report) -> int:
+    from tensor_stereo.reports.sweep.report import write_report
+    from tensor_stereo.reports.sweep.runs import load_run
+
+    runs = [load_run(run) for run in command.runs]
+    out = command.out
+    if out is None:
+        names = [run.resolve().name for run in command.runs]
+        out = command.runs[-1] if len(names) == 1 else command.runs[-1].parent / f"{names[0]}-and-{names[1]}"
+    for path in write_report(runs, out):
         print(path)
+    pairs = [set(run.results.select("dataset", "scene").unique().iter_rows()) for run in runs]
+    if len(pairs) == 2 and not pairs[0] & pairs[1]:
+        counts = f"{len(pairs[0])} and {len(pairs[1])}"
+        return fail(f"{command.runs[0]} and {command.runs[1]} have no pair in common, of {counts}")
+    return OK
 
 
-def _run_classify(command: Classify) -> None:
+def _run_classify(command: Classify) -> int:
+    from tensor_stereo.reports.pair import classify_files
+
     summary = classify_files(
         command.left,
         command.right,
@@ -87,22 +134,46 @@ def _run_classify(command: Classify) -> None:
     )
     values = asdict(summary)
     rates = values.pop("rates") or {}
+    num_agreeing = values.pop("num_agreeing")
     kept_by = {f"kept_by_{name}": count for name, count in values.pop("kept_by").items()}
     for name, value in (values | kept_by | rates).items():
         print(f"{name:20}{value:8.2f}" if isinstance(value, float) else f"{name:20}{value:8}")
+    if summary.rates is not None and summary.rates.fraction_incorrect != summary.rates.fraction_incorrect:
+        return fail(f"no match has known ground truth in {command.disparity_gt}, so there are no rates")
+    return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)
 
 
-def _progress(dataset: SyntheticDataset | PairDataset, config: EvaluationConfig) -> Iterator[PairEvaluation]:
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("evaluate", total=len(dataset) * len(config.detectors))
-        for result in evaluate_dataset((dataset[k] for k in range(len(dataset))), config):
-            progress.update(task, advance=1, description=f"{result.pair.name} {result.detector}")
+def _check_kept(num_kept: int, num_matches: int, num_agreeing: int) -> int:
+    """The exit code: an empty result although most matches agree is hardly what was asked for."""
+    if num_kept or 2 * num_agreeing <= num_matches:
+        return OK
+    return fail(
+        f"no match is kept, although {num_agreeing} of {num_matches} agree with their neighbours; are the pairs "
+        "rectified, the coordinates pixels, the target in reach? --verdict cardinality asks for neither"
+    )
+
+
+def _evaluate(dataset: Any, config: EvaluationConfig, errors: dict[str, str]) -> Iterator[Any]:
+    """Evaluations with progress; pairs that fail go to ``errors`` with their reason."""
+    from tensor_stereo.evaluation.dataset import evaluate_dataset
+
+    total, done, begun = len(dataset) * len(config.detectors), 0, time.monotonic()
+
+    def note(name: str, error: Exception) -> None:
+        nonlocal done
+        done += len(config.detectors)
+        errors[name] = " ".join(str(error).split())
+
+    with show_progress("evaluate") as show:
+        for result in evaluate_dataset(dataset, config, on_error=note):
+            done += 1
+            show(done, total, f"{result.pair.name} {result.detector}, {time_left(begun, done, total)}")
             yield result
 
 
-def _print_tables(tables: Iterable[Table]) -> None:
+def _print_tables(tables: Iterable[Any]) -> None:
+    from tensor_stereo.reports.tables import to_markdown
+
     console = Console()
     for table in tables:
         if not console.is_terminal:
@@ -116,12 +187,12 @@ def _print_tables(tables: Iterable[Table]) -> None:
         console.print(view)
 
 
-_RUNNERS: dict[type, Callable[[Any], None]] = {
+_RUNNERS: dict[type, Callable[[Any], int]] = {
     Demo: _run_demo,
     Classify: _run_classify,
     Evaluate: _run_evaluate,
     Filter: _run_filter,
-    Download: run_download_command,
+    Download: _run_download,
     Index: _run_index,
     Render: _run_render,
     Report: _run_report,

@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from datetime import timedelta
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from pathlib import Path
 
 from tensor_stereo.cli.commands import Sweep
+from tensor_stereo.cli.endings import INTERRUPTED, OK, fail, most_frequent
+from tensor_stereo.cli.progress import describe_time, show_progress
 from tensor_stereo.datasets import read_manifest
 from tensor_stereo.evaluation.trials import STAGES
-from tensor_stereo.sweeps import SweepProgress, build_plan, read_grid, run_sweep
+from tensor_stereo.sweeps import SweepProgress, build_plan, read_errors, read_grid, read_results, run_sweep
 from tensor_stereo.sweeps.plan import Plan
 from tensor_stereo.sweeps.run import check_trials
 from tensor_stereo.sweeps.units import run_tasks
-
-SOME_FAILED, INTERRUPTED = 1, 130
-_PLAIN_SECONDS = 10.0  # between lines where the output is no terminal
 
 
 def run_sweep_command(command: Sweep) -> int:
@@ -31,8 +24,8 @@ def run_sweep_command(command: Sweep) -> int:
     shard = _parse_shard(command.shard)
     if command.dry_run:
         print_plan(build_plan(config, read_manifest(command.manifest, check_files=False)), shard)
-        return 0
-    with _show_progress() as show:
+        return OK
+    with show_progress("sweep") as show:
         summary = run_sweep(
             config,
             command.manifest,
@@ -45,7 +38,7 @@ def run_sweep_command(command: Sweep) -> int:
             retry_errors=command.retry_errors,
             verify=command.verify,
             log_level=command.log_level,
-            on_progress=show,
+            on_progress=lambda state: show(state.num_done, state.num_units, _describe(state)),
         )
     end = summary.progress
     print(f"{end.num_done} of {end.num_units} units done, {end.num_new} now, {end.num_failed} failed: {command.out}")
@@ -54,7 +47,18 @@ def run_sweep_command(command: Sweep) -> int:
     if summary.interrupted:
         print("Interrupted; the same command goes on.")
         return INTERRUPTED
-    return SOME_FAILED if end.num_failed else 0
+    if end.num_failed:
+        reasons = read_errors(command.out)["message"].to_list()
+        return fail(f"{end.num_failed} of {end.num_units} units failed: {most_frequent(reasons)}")
+    if end.num_done == end.num_units and not config.export_matches and not _has_ground_truth(command.out):
+        return fail("no pair has known ground truth, so there are no rates; matches come with export_matches = true")
+    return OK
+
+
+def _has_ground_truth(run: Path) -> bool:
+    """Whether any match of a run has known ground truth; True of a run without rows."""
+    counts = read_results(run)["num_valid"]
+    return counts.is_empty() or bool((counts > 0).any())
 
 
 def print_plan(plan: Plan, shard: tuple[int, int]) -> None:
@@ -80,38 +84,13 @@ def print_plan(plan: Plan, shard: tuple[int, int]) -> None:
             f"{seconds:>9.3f}",
         )
     files = plan.pairs[pair]
-    print(f"Timed on {files.dataset}/{files.scene}: about {_time(total * num_pairs)} for all on one worker.")
+    print(f"Timed on {files.dataset}/{files.scene}: about {describe_time(total * num_pairs)} for all on one worker.")
 
 
-@contextmanager
-def _show_progress() -> Iterator[Callable[[SweepProgress], None]]:
-    """A bar on a terminal, a line every ten seconds elsewhere."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        last = time.monotonic()
-
-        def print_line(state: SweepProgress) -> None:
-            nonlocal last
-            if time.monotonic() - last >= _PLAIN_SECONDS:
-                last = time.monotonic()
-                print(f"{state.num_done}/{state.num_units} units, {_rate(state)}", file=sys.stderr, flush=True)
-
-        yield print_line
-        return
-    columns = TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}")
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("sweep", total=None, rate="")
-        yield lambda state: progress.update(task, completed=state.num_done, total=state.num_units, rate=_rate(state))
-
-
-def _rate(state: SweepProgress) -> str:
-    left = "" if math.isnan(state.seconds_left) else f", {_time(state.seconds_left)} left"
+def _describe(state: SweepProgress) -> str:
+    left = "" if math.isnan(state.seconds_left) else f", {describe_time(state.seconds_left)} left"
     failed = f", {state.num_failed} failed" if state.num_failed else ""
     return f"{state.units_per_second:.1f} units/s{left}{failed}"
-
-
-def _time(seconds: float) -> str:
-    return "unknown time" if math.isnan(seconds) else str(timedelta(seconds=round(seconds)))
 
 
 def _parse_shard(text: str) -> tuple[int, int]:

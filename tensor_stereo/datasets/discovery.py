@@ -25,6 +25,9 @@ _EXPECTED = """\
   Sintel stereo:             training/clean_left, clean_right, final_left, final_right, disparities/*/frame_*.png"""
 
 
+_READERS = (middlebury_pairs, kitti_pairs, eth3d_pairs, sceneflow_pairs, sintel_pairs)
+
+
 def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: float | None = None) -> list[PairFiles]:
     """Find the stereo pairs of every known release in ``root`` and below.
 
@@ -58,7 +61,7 @@ def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: 
     [('middlebury-2005', 'Art', 3.0)]
     """
     check_gt_scale(gt_scale)
-    pairs = collect_pairs(root, [middlebury_pairs, kitti_pairs, eth3d_pairs, sceneflow_pairs, sintel_pairs])
+    pairs = collect_pairs(root, _READERS)
     if not pairs:
         raise ValueError(f"no stereo pairs in {root} or below; looked for these layouts:\n{_EXPECTED}")
     pairs = _tell_apart(pairs, Path(root))
@@ -70,6 +73,36 @@ def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: 
         if pair.disparity_gt is not None and pair.gt_scale is None:
             raise missing_scale(pair)
     return pairs
+
+
+def find_scale(image0: Path, disparity_gt: Path) -> float | None:
+    """Stored value / px of disparity of a map of a known release, by the same rule as :func:`find_pairs`.
+
+    Args:
+        image0: Image of view 0.
+        disparity_gt: Map of the same pair.
+
+    Returns:
+        The scale; None if no release knows these files as one pair, or none tells its scale.
+
+    >>> find_scale(Path("no/such/view1.png"), Path("no/such/disp1.png")) is None
+    True
+    """
+    for folder in list(image0.absolute().parents)[:3]:
+        for reader in _READERS:
+            try:
+                pairs = reader(folder)
+            except (ValueError, OSError):  # no complete scene of this release
+                continue
+            for pair in pairs:
+                maps = (pair.disparity_gt, pair.disparity_noc_gt)
+                if _is_same(pair.image0, image0) and any(_is_same(path, disparity_gt) for path in maps):
+                    return pair.gt_scale
+    return None
+
+
+def _is_same(path: Path | None, other: Path) -> bool:
+    return path is not None and path.is_file() and other.is_file() and path.samefile(other)
 
 
 def _tell_apart(pairs: Sequence[PairFiles], root: Path) -> list[PairFiles]:

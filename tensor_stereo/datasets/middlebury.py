@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from tensor_stereo.datasets.eth3d import is_eth3d_scene
-from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
+from tensor_stereo.datasets.files import PairFiles, StrPath, Views, collect_pairs, find_file, find_views, parent_names
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.datasets.middlebury_scales import find_release, folder_year, integer_scale
 
@@ -106,8 +107,7 @@ def middlebury_pairs(folder: Path) -> list[PairFiles]:
         dataset = "middlebury" if release is None else f"middlebury-{release}"
         scale = None
         if views.disparity_gt is not None:
-            width, _ = image_size(views.image0)
-            scale = integer_scale(folder, width=width, years=layout.years)
+            scale = integer_scale(folder, width=_width(views), years=layout.years)
         return [PairFiles(dataset, scene, *views, gt_scale=scale)]
     if is_eth3d_scene(folder):  # same file names
         return []
@@ -136,3 +136,12 @@ def _float_release(folder: Path, scene: str, disparity: Path | None) -> str:
     if _SCENES_2014.fullmatch(scene):
         return "middlebury-2014"
     return "middlebury-2021" if _SCENES_2021.fullmatch(scene) else "middlebury"
+
+
+def _width(views: Views) -> int:
+    """Width in px of the first file of a pair that can be read; one damaged file must not hide the other pairs."""
+    paths = [path for path in views if path is not None]
+    for path in paths[:-1]:
+        with suppress(ValueError):
+            return image_size(path)[0]
+    return image_size(paths[-1])[0]

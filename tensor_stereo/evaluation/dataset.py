@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import polars as pl
 import torch
+from torch.utils.data import Dataset
 
 from tensor_stereo.configs import ConsensusConfig, Detector, EvaluationConfig, SweepConfig
 from tensor_stereo.evaluation.metrics import IsolatedCounts, isolated_update
@@ -55,6 +57,8 @@ ROW_SCHEMA: dict[str, Any] = {
     "specificity": pl.Float64,  # correct matches kept
     "ppv": pl.Float64,
     "npv": pl.Float64,
+    "precision": pl.Float64,  # of the kept matches, those that are correct: npv
+    "recall": pl.Float64,  # of the correct matches, those that are kept: specificity
     "auc": pl.Float64,  # of the score; null without score, so for the next three
     "specificity_at_sensitivity_96": pl.Float64,
     "score_counts_correct": pl.List(pl.Int64),  # 128 equal bins of [0, 1]; they add up over pairs
@@ -92,15 +96,20 @@ class PairEvaluation:
 
 
 def evaluate_dataset(
-    dataset: Iterable[StereoPair], config: EvaluationConfig = EvaluationConfig()
+    dataset: Iterable[StereoPair] | Dataset[StereoPair],
+    config: EvaluationConfig = EvaluationConfig(),
+    *,
+    on_error: Callable[[str, Exception], None] | None = None,
 ) -> Iterator[PairEvaluation]:
     """Classify every pair of a dataset with every detector and hold the verdicts against ground truth.
 
     Each detector runs once on noise first, so that no scene's run-time contains the start-up of libraries.
 
     Args:
-        dataset: pairs with ``disparity_gt``.
+        dataset: Pairs with ``disparity_gt``, one after another, or a map-style data set of them.
         config: settings of every step.
+        on_error: Called with the name of a pair that cannot be read or evaluated and the reason, after which the next
+            pair follows; None: the error is raised.
 
     Yields:
         One evaluation per pair and detector, as soon as it is there.
@@ -112,9 +121,33 @@ def evaluate_dataset(
     blank = StereoPair("warm-up", noise, noise, torch.zeros(96, 96))
     for detector in config.detectors:
         evaluate_pair(blank, detector, config)
+    for name, read in _readers(dataset):
+        try:
+            pair = read()
+            evaluations = [evaluate_pair(pair, detector, config) for detector in config.detectors]
+        except (ValueError, TypeError, OSError) as error:
+            if on_error is None:
+                raise
+            on_error(name, error)
+            continue
+        yield from evaluations
+
+
+def _readers(
+    dataset: Iterable[StereoPair] | Dataset[StereoPair],
+) -> Iterator[tuple[str, Callable[[], StereoPair]]]:
+    """Name of each pair and what reads it."""
+    if isinstance(dataset, Dataset):
+        names = getattr(dataset, "names", None)
+        for k in range(len(dataset)):  # type: ignore[arg-type]
+            yield names[k] if names else f"pair {k}", partial(dataset.__getitem__, k)
+        return
     for pair in dataset:
-        for detector in config.detectors:
-            yield evaluate_pair(pair, detector, config)
+        yield pair.name, partial(_same, pair)
+
+
+def _same(pair: StereoPair) -> StereoPair:
+    return pair
 
 
 def evaluate_pair(

@@ -70,6 +70,8 @@ class Rates:
         specificity: correct matches that are kept / correct matches.
         ppv: incorrect matches that are rejected / rejected matches.
         npv: correct matches that are kept / kept matches.
+        precision: the same as ``npv``, in the words of the field: of the kept matches, those that are correct.
+        recall: the same as ``specificity``: of the correct matches, those that are kept.
         fraction_incorrect: incorrect matches / matches.
     """
 
@@ -77,6 +79,8 @@ class Rates:
     specificity: float
     ppv: float
     npv: float
+    precision: float
+    recall: float
     fraction_incorrect: float
 
 
@@ -111,11 +115,15 @@ class Confusion:
 
     def rates(self) -> Rates:
         """Rates of the counts, NaN where a denominator is 0."""
+        precision = _ratio(self.true_negative, self.true_negative + self.false_negative)
+        recall = _ratio(self.true_negative, self.true_negative + self.false_positive)
         return Rates(
             sensitivity=_ratio(self.true_positive, self.true_positive + self.false_negative),
-            specificity=_ratio(self.true_negative, self.true_negative + self.false_positive),
+            specificity=recall,
             ppv=_ratio(self.true_positive, self.true_positive + self.false_positive),
-            npv=_ratio(self.true_negative, self.true_negative + self.false_negative),
+            npv=precision,
+            precision=precision,
+            recall=recall,
             fraction_incorrect=_ratio(self.true_positive + self.false_negative, self.num_valid),
         )
 

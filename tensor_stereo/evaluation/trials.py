@@ -74,6 +74,8 @@ class Trial:
             "specificity": rates.specificity,
             "ppv": rates.ppv,
             "npv": rates.npv,
+            "precision": rates.precision,
+            "recall": rates.recall,
             **self._score_row(),
             "seconds": self.seconds,
         }

@@ -8,27 +8,19 @@ from pathlib import Path
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.configs import FileFilterConfig, FilterConfig
 from tensor_stereo.interop.colmap import filter_colmap
+from tensor_stereo.interop.formats import check_files
 from tensor_stereo.interop.hloc import filter_hloc
 from tensor_stereo.interop.match_tables import filter_table
 from tensor_stereo.interop.npz import filter_npz, holds_indices
 from tensor_stereo.interop.verdicts import FilterSummary
 from tensor_stereo.modules import DelaunayFilter
 
-# Ending -> first bytes of such a file, and what it is called.
-_FORMATS = {
-    ".npz": (b"PK", "NumPy archive"),
-    ".csv": (b"", "CSV file"),
-    ".parquet": (b"PAR1", "Parquet file"),
-    ".h5": (b"\x89HDF\r\n\x1a\n", "HDF5 file"),
-    ".db": (b"SQLite format 3\0", "SQLite database"),
-}
-
 
 def filter_file(
-    source: Path,
-    out: Path,
+    source: Path | str,
+    out: Path | str,
     *,
-    keypoints: Path | None = None,
+    keypoints: Path | str | None = None,
     config: FilterConfig | None = None,
 ) -> FilterSummary:
     r"""Decide which matches of a file are right, and write the file again with verdict and score.
@@ -52,7 +44,8 @@ def filter_file(
 
     Args:
         source: file of putative matches. It is not changed.
-        out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced.
+        out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced,
+            and its folder is made.
         keypoints: hloc's file of features; for ``.h5`` only.
         config: Settings of verdict and score; None, or ``verdict=None`` of a
             :class:`~tensor_stereo.configs.FileFilterConfig`, leaves the verdict to the form of the file. In files of
@@ -64,7 +57,7 @@ def filter_file(
     Raises:
         ValueError: if a file is damaged or a value in it is wrong (naming file, pair and row or column), the ending is
             none of these, or ``out`` is the same file as ``source`` or ``keypoints``.
-        FileNotFoundError: if a file or the folder of ``out`` is missing.
+        FileNotFoundError: if a file is missing.
         OSError: if ``out`` cannot be written.
         ImportError: if h5py (``.h5``) or pycolmap (``.db``) is needed and not installed.
 
@@ -77,7 +70,9 @@ def filter_file(
         ...     filter_file(source, out, config=config).num_kept, out.read_text().splitlines()[:2]
         (4, ['x0,y0,x1,y1,inlier,relation', '0,0,-3,0,true,equal'])
     """
-    ending = _check_files(source, out, keypoints)
+    source, out = Path(source), Path(out)
+    keypoints = None if keypoints is None else Path(keypoints)
+    ending = check_files(source, out, keypoints)
     settings = {} if config is None else {f.name: getattr(config, f.name) for f in fields(FilterConfig)}
     of_any_views = ending in (".h5", ".db") or (ending == ".npz" and holds_indices(source))
     config = FileFilterConfig(**settings).resolve(rectified=not of_any_views)
@@ -92,28 +87,3 @@ def filter_file(
         if keypoints is not None:
             return filter_hloc(source, target, run, keypoints)
         return filter_table(source, target, run)
-
-
-def _check_files(source: Path, out: Path, keypoints: Path | None) -> str:
-    """The ending, after a look at all three files."""
-    ending = source.suffix.casefold()
-    if ending not in _FORMATS:
-        raise ValueError(f"source must end in {', '.join(_FORMATS)}, got {source.name!r}")
-    if out.suffix.casefold() != ending:
-        raise ValueError(f"out must end in {ending} as source does, got {out.name!r}")
-    if (keypoints is not None) != (ending == ".h5"):
-        raise ValueError(f"keypoints must be given for .h5, and only for it, got {keypoints} for {source.name!r}")
-    for name, path, kind in (("source", source, ending), ("keypoints", keypoints, ".h5")):
-        if path is None:
-            continue
-        if not path.is_file():
-            raise FileNotFoundError(f"{name}: there is no file {path}")
-        if path.resolve() == out.resolve() or (out.exists() and out.samefile(path)):
-            raise ValueError(f"out must be another file than {name}, got {out} for both")
-        first, called = _FORMATS[kind]
-        with path.open("rb") as file:
-            if file.read(len(first)) != first:
-                raise ValueError(f"{path} is no {called}, whatever its ending says")
-    if not out.parent.is_dir():
-        raise FileNotFoundError(f"out: there is no folder {out.parent}")
-    return ending

@@ -36,6 +36,7 @@ class FilterSummary:
     num_kept: int = 0
     num_rejected: int = 0
     num_untested: int = 0
+    num_agreeing: int = 0  # whose neighbours in one view contain those in the other
 
     def add(self, num_pairs: int, verdicts: Verdicts) -> FilterSummary:
         """The counts with those of ``num_pairs`` more pairs."""
@@ -47,6 +48,7 @@ class FilterSummary:
             self.num_kept + num_kept,
             self.num_rejected + num_matches - num_kept - num_untested,
             self.num_untested + num_untested,
+            self.num_agreeing + int(((verdicts.relation > 0) & (verdicts.relation < Relation.CONFLICT)).sum()),
         )
 
 

@@ -62,6 +62,11 @@ def write_evaluation(
     return tables
 
 
+def write_errors(errors: Mapping[str, str], out: Path) -> None:
+    """Write the reason why each of some pairs failed, by its name, to errors.json."""
+    (out / "errors.json").write_text(json.dumps(dict(errors), indent=1) + "\n")
+
+
 def draw_evaluation(result: PairEvaluation, config: EvaluationConfig, path: Path) -> None:
     """Draw the verdict of the score, if there is one, and that of the paper, constrained by objects, on one pair."""
     paper = next(t for t in reversed(result.trials) if t.config.verdict == config.restriction)

@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import ConnectionPatch
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
@@ -27,6 +28,7 @@ DPI = 100
 _PANEL_AREA_IN2, _MIN_WIDTH_IN, _MAX_WIDTH_IN = 22.0, 5.2, 9.0  # of one panel
 _GAP_IN, _TITLE_IN, _LABEL_IN, _LEGEND_IN = 0.12, 0.36, 0.24, 0.34
 _FONT_SIZE = 9
+_NUM_CELLS = 7  # along the longer side of an image; of each one match is joined across the views
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def draw_classification(
 
     The marker is the verdict, a disc for kept and a cross for rejected; the colour is the truth, blue for correct,
     vermillion for incorrect, grey for unknown. Without ground truth the classes are kept, rejected and untested. Edges
-    that both graphs have are told from those of one view only.
+    that both graphs have are told from those of one view only. Lines join some of the kept matches across the views.
 
     Args:
         image0: (C, H, W) uint8 of view 0, C = 1 or 3 (RGB); drawn in grey so that colours mean matches only.
@@ -117,10 +119,11 @@ def draw_classification(
     shared = [np.isin(edges[view], edges[1 - view]) for view in (0, 1)]
 
     layout = _Layout(image0, title, num_rows=len(rows) + 1)
+    panels: list[list[Axes]] = [[] for _ in rows]
     for view, (image, contours) in enumerate(((image0, contours0), (image1, contours1))):
         gray = _gray(image)
         for row, (name, classes) in enumerate(zip(verdicts, rows, strict=True)):
-            layout.draw_matches(row, view, gray, classes, keypoints[view], name)
+            panels[row].append(layout.draw_matches(row, view, gray, classes, keypoints[view], name))
         num_edges, num_shared = len(edges[view]), int(shared[view].sum())
         label = f"Delaunay graph of view {view}: {num_edges} edges, {num_shared} of them in both views"
         lower = layout.panel(len(rows), view, label, gray, strength=0.25)
@@ -133,6 +136,7 @@ def draw_classification(
         lower.plot(*keypoints[view].T, linestyle="none", marker=".", markersize=2.5, color="black")
     for row, classes in enumerate(rows):
         layout.legend(row, [item.handle() for item in classes])
+        layout.join(panels[row], classes, keypoints)
     lines = {"edge in both views": BLUE, "edge in one view only": VERMILLION}
     if contours0 is not None or contours1 is not None:
         lines["object contour"] = GREEN
@@ -165,9 +169,11 @@ def draw_matches(
     _check_pair(image0, image1, matches)
     classes = _truth_classes(inlier, correct, valid, matches.num_matches)
     layout = _Layout(image0, title, num_rows=1)
+    panels: list[Axes] = []
     for view, (image, points) in enumerate(((image0, matches.keypoints0), (image1, matches.keypoints1))):
-        layout.draw_matches(0, view, _gray(image), classes, points.numpy(force=True))
+        panels.append(layout.draw_matches(0, view, _gray(image), classes, points.numpy(force=True)))
     layout.legend(0, [item.handle() for item in classes])
+    layout.join(panels, classes, [points.numpy(force=True) for points in (matches.keypoints0, matches.keypoints1)])
     return layout.figure
 
 
@@ -253,11 +259,35 @@ class _Layout:
         classes: Sequence[_Class],
         keypoints: NDArray[np.floating],
         name: str = "",
-    ) -> None:
+    ) -> Axes:
         where = f"view {view} ({('left', 'right')[view]})"
         axes = self.panel(row, view, f"{name}: {where}" if name else where, gray, strength=0.5)
         for item in reversed(classes):  # the first on top
             item.draw(axes, keypoints)
+        return axes
+
+    def join(
+        self, panels: Sequence[Axes], classes: Sequence[_Class], keypoints: Sequence[NDArray[np.floating]]
+    ) -> None:
+        """Lines across both views for some of the kept matches, at most one from each cell of a coarse grid."""
+        taken: set[tuple[int, ...]] = set()
+        cell = max(panels[0].get_xlim()[1], panels[0].get_ylim()[0]) / _NUM_CELLS
+        for item in classes:
+            for k in np.flatnonzero(item.mask) if item.marker == "o" else ():
+                place = tuple((keypoints[0][k] // cell).astype(int))
+                if place in taken or not np.isfinite([keypoints[0][k], keypoints[1][k]]).all():
+                    continue
+                taken.add(place)
+                line = ConnectionPatch(
+                    keypoints[0][k],
+                    keypoints[1][k],
+                    coordsA=panels[0].transData,
+                    coordsB=panels[1].transData,
+                    color=item.color,
+                    linewidth=0.6,
+                    alpha=0.6,
+                )
+                self.figure.add_artist(line)
 
     def legend(self, row: int, handles: list[Line2D]) -> None:
         y = (self._bottom(row) - 0.5 * _LEGEND_IN) / self.size[1]

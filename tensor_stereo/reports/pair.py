@@ -12,9 +12,11 @@ from torch import Tensor
 from tensor_stereo.classification import verdicts_by_name
 from tensor_stereo.configs import PipelineConfig, describe_settings
 from tensor_stereo.datasets import PairFiles, read_pair
+from tensor_stereo.datasets.discovery import find_scale
 from tensor_stereo.evaluation.metrics import Rates, match_rates, matches_against_gt
 from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
+from tensor_stereo.paths import prepare_target
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.types import Relation, StereoPair
@@ -32,6 +34,7 @@ class MatchSummary:
         num_kept: Those that the verdict of the settings keeps.
         num_rejected: Those that it rejects on evidence.
         num_untested: Those without evidence, which it rejects too.
+        num_agreeing: Those whose neighbours in one view contain those in the other.
         kept_by: What each verdict keeps: ``adjacency``, ``cardinality``, and ``score`` if there is one that can decide.
         rates: Of the verdict of the settings against ground truth, or None.
     """
@@ -40,6 +43,7 @@ class MatchSummary:
     num_kept: int
     num_rejected: int
     num_untested: int
+    num_agreeing: int
     kept_by: dict[str, int]
     rates: Rates | None = None
 
@@ -61,7 +65,7 @@ def classify_files(
         right: Image of view 1, of the same size.
         config: Settings of every step; None means the defaults.
         disparity_gt: Ground truth of view 0, PFM or PNG.
-        gt_scale: Stored value / px of disparity in a PNG map.
+        gt_scale: Stored value / px of disparity in a PNG map; None: the one of the release, if its folders tell it.
         out: File .csv or .parquet for :func:`match_table`.
         figure: File .png for both views, their matches by every verdict that decides, and their graphs.
 
@@ -70,24 +74,23 @@ def classify_files(
 
     Raises:
         ValueError: for damaged images, views of different size, or another ending of ``out`` or ``figure``.
-        FileNotFoundError: if a file or the folder of a result is missing.
+        FileNotFoundError: if a file is missing.
+        OSError: if a result cannot be written; its folder is made.
     """
     config = config or PipelineConfig()
     left, right = Path(left), Path(right)
     disparity_gt, out, figure = (None if path is None else Path(path) for path in (disparity_gt, out, figure))
-    if out is not None and out.suffix not in ENDINGS:
-        raise ValueError(f"out must end in {' or '.join(ENDINGS)}, got {out.name!r}")
-    if figure is not None and figure.suffix != ".png":
-        raise ValueError(f"figure must end in .png, got {figure.name!r}")
-    for name, path in (("out", out), ("figure", figure)):
-        if path is not None and not path.parent.is_dir():
-            raise FileNotFoundError(f"{name}: there is no folder {path.parent}")
+    for name, path, endings in (("out", out, ENDINGS), ("figure", figure, (".png",))):
+        if path is not None:
+            prepare_target(name, path, endings)
+    if disparity_gt is not None and gt_scale is None:
+        gt_scale = find_scale(left, disparity_gt)
     pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale))
     output = run_pipeline([(pair.image0, pair.image1)], config)
     truth = None if pair.disparity_gt is None else matches_against_gt(output.matches, [pair.disparity_gt])
     if out is not None:
         table = match_table(output, config, truth)
-        table.write_csv(out) if out.suffix == ".csv" else table.write_parquet(out)
+        table.write_csv(out) if out.suffix.casefold() == ".csv" else table.write_parquet(out)
     if figure is not None:
         write_figure(_draw(pair, output, config, truth), figure)
     verdict = output.classification
@@ -98,6 +101,7 @@ def classify_files(
         num_kept=num_kept,
         num_rejected=output.matches.num_matches - num_kept - num_untested,
         num_untested=num_untested,
+        num_agreeing=int(verdict.inlier_of("cardinality").sum()),
         kept_by={name: int(kept.sum()) for name, kept in _verdicts(output, config).items()},
         rates=None if truth is None else match_rates(verdict.inlier, *truth),
     )

@@ -61,8 +61,8 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
         restriction: The one of the paper whose records are shown, beside those of the score.
 
     Returns:
-        Tables 1-4 as far as there are records, how the score ranks matches if there is one, Table 5, the run-time by
-        stage, and the putative matches.
+        Tables 1-4 as far as there are records, what is kept, how the score ranks matches if there is one, Table 5, the
+        run-time by stage, and the putative matches.
 
     Raises:
         ValueError: if a record lacks a field, repeats another one, or names an unknown detector or variant.
@@ -71,10 +71,9 @@ def paper_tables(rows: Sequence[Row], *, restriction: Restriction = "cardinality
         >>> [table.title for table in paper_tables([])]  # doctest: +ELLIPSIS
         ['Table 5. Run-time...', 'Run-time by stage...', 'Putative matches...']
     """
-    scores = [score_table(rows)]
     return [
         *(rates_table(rows, detector, restriction=restriction) for detector in _detectors(_index(rows, restriction))),
-        *(table for table in scores if table.rows),
+        *(table for table in (kept_table(rows, restriction=restriction), score_table(rows)) if table.rows),
         runtime_table(rows, restriction=restriction),
         stage_table(rows, restriction=restriction),
         matches_table(rows, restriction=restriction),
@@ -112,6 +111,33 @@ def rates_table(rows: Sequence[Row], detector: str, *, restriction: Restriction 
         columns=("scene", *(f"{letter} {heading}" for letter in letters for heading in RATES.values())),
         rows=_with_mean(body),
     )
+
+
+def kept_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality") -> Table:
+    """What a user of the kept matches gets: how many there are, how many of them are correct, and how many of these.
+
+    One row per detector and verdict, as means over the scenes. Precision is the paper's NPV, recall its specificity.
+
+    Example:
+        >>> record = dict(scene="Art", detector="fast", variant="constrained", verdict="cardinality")
+        >>> record |= dict(true_negative=40, false_negative=10, precision=0.8, recall=0.5)
+        >>> kept_table([record]).text_rows()
+        [['FAST, cardinality, constrained', '50.00', '0.80', '0.50']]
+    """
+    body: list[tuple[Cell, ...]] = []
+    indexed = {verdict: _index(rows, verdict) for verdict in (restriction, "score")}
+    for detector in _detectors(key for records in indexed.values() for key in records):
+        for verdict, records in indexed.items():
+            for variant in VARIANTS:
+                found = [row for key, row in records.items() if key[1:] == (detector, variant) and "precision" in row]
+                if not found:
+                    continue
+                name = describe_verdict(found[0]) if verdict == "score" else f"{verdict}, {variant}"
+                kept = _mean([float(_field(row, "true_negative")) + _field(row, "false_negative") for row in found])
+                rates = (_mean([_value(row, rate) for row in found]) for rate in ("precision", "recall"))
+                body.append((f"{detector.upper()}, {name}", kept, *rates))
+    columns = ("kept by", "matches", "precision", "recall")
+    return Table("Kept matches with known ground truth, mean over the scenes", columns, tuple(body))
 
 
 def score_table(rows: Sequence[Row]) -> Table:

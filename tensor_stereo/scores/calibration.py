@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 # Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999), rectified or not; fitted by
-# benchmarks/calibrate_consensus.py on the real scenes of the training set.
+# benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
 _CONSENSUS = {True: (0.59, 2.60), False: (0.65, 2.25)}
 _LEAST = 1e-4  # probability, of either outcome
 _NUM_KNOTS = 2048  # linear between them, the probability is off by less than 3e-6

@@ -217,24 +217,25 @@ def test_bad_input_is_one_line_and_exit_code_2(scene: Path, tmp_path: Path, caps
     fails(["classify", left, right, "--disparity-gt", str(small), "--gt-scale", "4"], capsys, "small.png")
     fails(["classify", left, right, "--disparity-gt", str(scene / "scaled.png")], capsys, "--gt-scale")
     fails(["classify", left, right, "--out", str(tmp_path / "matches.xlsx")], capsys, "out", ".csv")
-    fails(["classify", left, right, "--out", str(tmp_path / "no" / "matches.csv")], capsys, "out")
+    (tmp_path / "file").touch()
+    fails(["classify", left, right, "--out", str(tmp_path / "file" / "matches.csv")], capsys, "--out", "made")
     fails(["evaluate", str(tmp_path / "nothing")], capsys, "nothing")
     fails(["evaluate", str(tmp_path)], capsys, "looked for")
     fails(["evaluate", str(scene), "--scenes", "Atlantis"], capsys, "Atlantis", "rendered")
-    fails(["classify", left, right, "--min-group-size", "0"], capsys, "min_group_size")
-    fails(["classify", left, right, "--threshold", "3"], capsys, "threshold", "[0, 1]")
+    fails(["classify", left, right, "--min-group-size", "0"], capsys, "--min-group-size")
+    fails(["classify", left, right, "--threshold", "3"], capsys, "--threshold", "[0, 1]")
 
 
 @pytest.mark.parametrize("command", ["classify", "evaluate", "filter"])
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["--verdict", "cardinality", "--threshold", "0.3"], ["threshold needs the verdict 'score'", "cardinality"]),
-        (["--verdict", "adjacency", "--min-precision", "0.9"], ["min_precision needs the verdict 'score'"]),
-        (["--verdict", "score", "--score", "topology"], ["threshold must be given", "no probability"]),
-        (["--verdict", "score", "--score", "topology", "--min-precision", "0.9"], ["min_precision needs a probab"]),
-        (["--verdict", "score", "--score", "none"], ["score must not be 'none'"]),
-        (["--threshold", "0.3", "--min-precision", "0.9"], ["min_precision must be None beside threshold"]),
+        (["--verdict", "cardinality", "--threshold", "0.3"], ["--threshold needs --verdict score", "cardinality"]),
+        (["--verdict", "adjacency", "--min-precision", "0.9"], ["--min-precision needs --verdict score"]),
+        (["--verdict", "score", "--score", "topology"], ["--threshold must be given", "no probability"]),
+        (["--verdict", "score", "--score", "topology", "--min-precision", "0.9"], ["--min-precision needs a probab"]),
+        (["--verdict", "score", "--score", "none"], ["--score must not be 'none'"]),
+        (["--threshold", "0.3", "--min-precision", "0.9"], ["--min-precision must be None beside --threshold"]),
     ],
 )
 def test_settings_that_contradict_each_other_are_one_line_and_exit_code_2(
@@ -253,8 +254,8 @@ def test_settings_that_contradict_each_other_are_one_line_and_exit_code_2(
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (["--fast.window-px", "10"], ["window_px", "odd", "got 10"]),
-        (["--consensus.slope", "-1"], ["ConsensusConfig.slope", "got -1"]),
+        (["--fast.window-px", "10"], ["--fast.window-px", "odd", "got 10"]),
+        (["--consensus.slope", "-1"], ["--consensus.slope", "got -1"]),
     ],
 )
 def test_a_nested_setting_out_of_its_limits_is_one_line_and_exit_code_2(
@@ -264,8 +265,10 @@ def test_a_nested_setting_out_of_its_limits_is_one_line_and_exit_code_2(
 
 
 def test_the_default_verdict_needs_no_name(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    fails(["classify", str(scene / "im0.png"), str(scene / "im1.png"), "--score", "topology"], capsys, "threshold must")
-    fails(["evaluate", str(scene), "--score", "none"], capsys, "score must not be 'none'")
+    fails(
+        ["classify", str(scene / "im0.png"), str(scene / "im1.png"), "--score", "topology"], capsys, "--threshold must"
+    )
+    fails(["evaluate", str(scene), "--score", "none"], capsys, "--score must not be 'none'")
     assert not list(tmp_path.iterdir())
 
 

@@ -69,5 +69,5 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.Ca
     fails(["download", "kitti-2051", "--out", str(tmp_path)], capsys, "kitti-2051", "kitti-2015")
     fails(["download", "--out", str(tmp_path)], capsys, "names")
     fails(["report", str(tmp_path)], capsys, "no run")
-    fails(["filter", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b.txt")], capsys, "source", ".npz")
+    fails(["filter", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b.txt")], capsys, "MATCHES", ".npz")
     fails(["filter", str(tmp_path / "a.csv"), "--out", str(tmp_path / "b.csv")], capsys, "a.csv")

@@ -169,10 +169,13 @@ def test_half_a_scene_is_an_error(tmp_path, write_scene, names):
         find_middlebury(tmp_path)
 
 
-def test_view_without_a_readable_header_is_named(tmp_path, write_scene):
+def test_a_view_without_a_readable_header_does_not_hide_the_pair_and_a_pair_without_any_is_named(tmp_path, write_scene):
     folder = write_scene(tmp_path / "Art", "view1.png view5.png disp1.png", width=463)
     (folder / "view1.png").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"view1\.png is empty"):
+    assert [pair.gt_scale for pair in find_middlebury(tmp_path)] == [3]  # told by the other files
+    for name in ("view5.png", "disp1.png"):
+        (folder / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=r"disp1\.png is empty"):
         find_middlebury(tmp_path)
 
 

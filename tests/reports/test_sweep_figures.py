@@ -88,7 +88,7 @@ def test_curves_and_verdicts_lie_where_the_counts_say(results: pl.DataFrame) -> 
         for k, curve in enumerate(item.curves):
             expected = (
                 (roc, defined(1 - curve.specificity, curve.sensitivity)),
-                (recall, defined(curve.sensitivity, curve.ppv)),
+                (recall, defined(curve.specificity, curve.precision)),
             )
             for plot, points in expected:
                 ((_, line, _),) = [path for path in plot.paths("line") if f"c{k}" in path[0]]

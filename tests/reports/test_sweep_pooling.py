@@ -50,6 +50,7 @@ def test_rates_of_a_trial_are_those_of_all_its_matches(results: pl.DataFrame) ->
         rows = results.filter(pl.col("trial") == row["trial"])
         tp, fp, tn, fn = (rows[name].sum() for name in CELLS)
         expected = ((tp + fn) / (tp + fp + tn + fn), tp / (tp + fn), tn / (tn + fp), tp / (tp + fp), tn / (tn + fn))
+        expected += (tn / (tn + fn), tn / (tn + fp))  # precision and recall of the kept correct matches
         assert tuple(row[name] for name in VERDICT_RATES) == expected
         assert row["num_pairs"] == 5
         assert row["num_matches"] == rows["num_matches"].sum()
@@ -194,10 +195,11 @@ def test_curves_hold_every_threshold_and_the_trials_that_share_them(results: pl.
                 rejected, lost = (incorrect <= threshold).sum(), (correct <= threshold).sum()
                 assert curve.sensitivity[k] == pytest.approx(rejected / len(incorrect), abs=1e-12)
                 assert curve.specificity[k] == pytest.approx(1 - lost / len(correct), abs=1e-12)
-                if rejected + lost:
-                    assert curve.ppv[k] == pytest.approx(rejected / (rejected + lost), abs=1e-12)
+                kept, wrong = len(correct) - lost, len(incorrect) - rejected
+                if kept + wrong:
+                    assert curve.precision[k] == pytest.approx(kept / (kept + wrong), abs=1e-12)
                 else:
-                    assert math.isnan(curve.ppv[k])
+                    assert math.isnan(curve.precision[k])
 
 
 def test_a_verdict_by_score_is_a_point_of_the_curve_that_it_shares_with_the_others() -> None:
@@ -209,8 +211,8 @@ def test_a_verdict_by_score_is_a_point_of_the_curve_that_it_shares_with_the_othe
         assert [row["verdict"] for row in curve.trials] == ["score", "adjacency", "cardinality"]
         assert [decided_by_score(row) for row in curve.trials] == [True, False, False]
         at = SCORE_BINS // 2  # what lies below .5 is rejected
-        by_score, *others = [(row["sensitivity"], row["specificity"], row["ppv"]) for row in curve.trials]
-        assert by_score == pytest.approx((curve.sensitivity[at], curve.specificity[at], curve.ppv[at]), rel=1e-12)
+        by_score, *others = [(row["sensitivity"], row["specificity"], row["precision"]) for row in curve.trials]
+        assert by_score == pytest.approx((curve.sensitivity[at], curve.specificity[at], curve.precision[at]), rel=1e-12)
         for other in others:
             assert other[:2] != pytest.approx(by_score[:2], rel=1e-3)
 

@@ -86,15 +86,15 @@ def _figure(
         description=f"ROC of {title}. {areas}.",
     )
     recall = Plot(
-        rate_axis("recall (sensitivity)"),
-        rate_axis("precision (PPV)"),
+        rate_axis("recall: correct matches kept"),
+        rate_axis("precision: kept matches that are correct"),
         title=f"{title}: precision-recall",
-        description=f"Precision against recall of {title}, positive is an incorrect match. {areas}.",
+        description=f"Precision against recall of the kept correct matches of {title}. {areas}.",
     )
     roc.line([0, 1], [0, 1], Key("", INK, style="chance"))
     for item in drawn:
         roc.line(1 - item.curve.specificity, item.curve.sensitivity, item.key)
-        recall.line(item.curve.sensitivity, item.curve.ppv, item.key)
+        recall.line(item.curve.specificity, item.curve.precision, item.key)
     verdicts = [(item.run, row, item.key.color) for item in drawn for row in item.curve.trials]
     verdicts += [(k, row, INK) for k, of_run in enumerate(of_runs) if of_run for row in of_run.verdicts]
     seen: set[tuple[Any, ...]] = set()
@@ -107,7 +107,7 @@ def _figure(
         mark = Key("", color, shape=shape, filled=len(runs) == 1 or k == 1)
         tip = _tip(f"{run_prefix(runs, k)}trial {row['trial']}", row)
         roc.mark(1 - row["specificity"], row["sensitivity"], mark, tip=tip)
-        recall.mark(row["sensitivity"], row["ppv"], mark, tip=tip)
+        recall.mark(row["recall"], row["precision"], mark, tip=tip)
     roc.mark(1 - PAPER_SPECIFICITY, PAPER_SENSITIVITY, Key("", INK, shape="star"), tip=PAPER_CLAIM)
     num_curves = sum(len(of_run.curves) for of_run in of_runs if of_run)
     chosen = f" The {len(drawn)} curves with the largest area of {num_curves}." if len(drawn) < num_curves else ""
@@ -129,5 +129,5 @@ def _level(found: DetectorCurves) -> str:
 
 
 def _tip(start: str, row: Mapping[str, Any]) -> str:
-    names = ("sensitivity", "specificity", "ppv", "npv")
+    names = ("sensitivity", "specificity", "precision", "recall")
     return "\n".join([start, *(f"{name} {rate_text(row[name])}" for name in names)])

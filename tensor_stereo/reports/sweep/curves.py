@@ -21,14 +21,14 @@ class ScoreCurve:
         trials: rows of the trials that have this score; they differ in their verdicts only.
         sensitivity: (U + 1,) fraction of the incorrect matches rejected, from rejecting none to rejecting all.
         specificity: (U + 1,) fraction of the correct matches kept.
-        ppv: (U + 1,) fraction of the rejected matches that are incorrect; NaN where none is rejected.
+        precision: (U + 1,) fraction of the kept matches that are correct; NaN where none is kept.
         auc: area under the ROC curve.
     """
 
     trials: tuple[dict[str, Any], ...]
     sensitivity: NDArray[np.float64]
     specificity: NDArray[np.float64]
-    ppv: NDArray[np.float64]
+    precision: NDArray[np.float64]
     auc: float
 
     def fixed_settings(self) -> list[str]:
@@ -89,7 +89,7 @@ def _curve(trials: list[dict[str, Any]]) -> ScoreCurve | None:
         return None
     points = counts.curve()
     sensitivity, specificity = points.sensitivity.numpy(), points.specificity.numpy()
-    rejected, lost = sensitivity * num_incorrect, (1 - specificity) * num_correct
-    total = rejected + lost
-    ppv = np.divide(rejected, total, out=np.full_like(total, np.nan), where=total > 0.5)  # counts, up to rounding
-    return ScoreCurve(tuple(trials), sensitivity, specificity, ppv, counts.auc())
+    kept, wrong = specificity * num_correct, (1 - sensitivity) * num_incorrect
+    total = kept + wrong
+    precision = np.divide(kept, total, out=np.full_like(total, np.nan), where=total > 0.5)  # counts, up to rounding
+    return ScoreCurve(tuple(trials), sensitivity, specificity, precision, counts.auc())

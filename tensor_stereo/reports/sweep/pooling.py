@@ -50,7 +50,7 @@ SETTINGS = {
 }
 CELLS = ("true_positive", "false_positive", "true_negative", "false_negative")
 TOTALS = ("num_matches", "num_valid", "num_untested", *CELLS)
-VERDICT_RATES = ("fraction_incorrect", "sensitivity", "specificity", "ppv", "npv")
+VERDICT_RATES = ("fraction_incorrect", "sensitivity", "specificity", "ppv", "npv", "precision", "recall")
 SCORE_RATES = ("auc", "specificity_at_sensitivity_96")
 PERTURBATIONS = ("outlier_rate", "noise_px")
 _BALANCED = (pl.col("sensitivity") + pl.col("specificity")) / 2

@@ -31,12 +31,15 @@ RATE_HEADINGS = {
     "specificity": "spec.",
     "ppv": "PPV",
     "npv": "NPV",
+    "precision": "precision",
+    "recall": "recall",
     "auc": "AUC",
     "specificity_at_sensitivity_96": "spec.@.96",
 }
 EXPLANATION = (
     "Positive means estimated incorrectly: sensitivity is the fraction of incorrect matches that are rejected, "
-    "specificity the fraction of correct matches that are kept; spec.@.96 is the specificity that a score reaches at "
+    "specificity the fraction of correct matches that are kept; precision and recall are those of the kept correct "
+    "matches, and equal to NPV and specificity; spec.@.96 is the specificity that a score reaches at "
     "sensitivity .96."
 )
 _MAX_VALUES = 12  # of a setting, written out

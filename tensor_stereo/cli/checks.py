@@ -1,0 +1,104 @@
+"""What can be said of a command before any work: paths, endings, names. Imports no torch, so errors come at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.interop.formats import check_files
+from tensor_stereo.paths import check_folder, check_source, prepare_folder, prepare_target
+
+TABLES, FIGURES, IMAGES = (".csv", ".parquet"), (".png",), ()
+
+
+def check(command: Any) -> None:
+    """Raise for what cannot work, and make the folders of the results.
+
+    Raises:
+        ValueError, OSError: naming the argument.
+    """
+    _CHECKS[type(command)](command)
+
+
+def _check_demo(command: Demo) -> None:
+    if command.num_pairs < 1:
+        raise ValueError(f"num_pairs must be at least 1, got {command.num_pairs}")
+    if command.out is not None:
+        prepare_folder("out", command.out)
+
+
+def _check_classify(command: Classify) -> None:
+    for name in ("left", "right", "disparity_gt"):
+        path = getattr(command, name)
+        if path is not None:
+            check_source(name, path)
+    for name, endings in (("out", TABLES), ("figure", FIGURES)):
+        path = getattr(command, name)
+        if path is not None:
+            prepare_target(name, path, endings)
+
+
+def _check_evaluate(command: Evaluate) -> None:
+    check_folder("root", command.root)
+    if command.out is not None:
+        prepare_folder("out", command.out)
+
+
+def _check_filter(command: Filter) -> None:
+    ending = check_files(command.matches, command.out, command.keypoints)
+    if ending != ".npz":  # an archive is opened later, to see what form it has
+        command.config.resolve(rectified=ending not in (".h5", ".db"))
+
+
+def _check_download(command: Download) -> None:
+    from tensor_stereo.datasets.download.releases import RELEASES
+
+    for name in command.releases:
+        if name not in RELEASES:
+            raise ValueError(f"releases must be among {', '.join(RELEASES)}, got {name!r}")
+    prepare_folder("out", command.out)
+
+
+def _check_index(command: Index) -> None:
+    for root in command.roots:
+        if not root.exists():
+            raise FileNotFoundError(f"roots: there is no file or folder {root}")
+    prepare_target("out", command.out, (".parquet",))
+
+
+def _check_render(command: Render) -> None:
+    prepare_folder("out", command.out)
+
+
+def _check_report(command: Report) -> None:
+    if not 1 <= len(command.runs) <= 2:
+        raise ValueError(f"runs must name one run folder, or two, got {len(command.runs)}")
+    for run in command.runs:
+        check_folder("runs", run)
+        if not (run / "config.json").is_file():
+            raise FileNotFoundError(f"runs: {run} is no run of a sweep: it has no config.json")
+    if command.out is not None:
+        prepare_folder("out", command.out)
+
+
+def _check_sweep(command: Sweep) -> None:
+    from tensor_stereo.sweeps.grid import read_grid
+
+    read_grid(command.settings)
+    check_source("manifest", command.manifest, (".parquet",))
+    if not command.dry_run:
+        prepare_folder("out", command.out)
+
+
+_CHECKS: dict[type, Callable[[Any], None]] = {
+    Demo: _check_demo,
+    Classify: _check_classify,
+    Evaluate: _check_evaluate,
+    Filter: _check_filter,
+    Download: _check_download,
+    Index: _check_index,
+    Render: _check_render,
+    Report: _check_report,
+    Sweep: _check_sweep,
+}

@@ -1,0 +1,54 @@
+"""Errors of the library in the words of the command line. Imports no torch."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any, get_type_hints
+
+from tensor_stereo import configs
+from tensor_stereo.cli import commands
+
+_FILES = {"source": "MATCHES", "left": "LEFT", "right": "RIGHT", "root": "ROOT", "roots": "ROOTS", "runs": "RUNS"}
+_FILES |= {"settings": "SETTINGS", "releases": "RELEASES", "matches": "MATCHES"}
+
+
+def name_flags(message: str) -> str:
+    """The message with flags in the place of Python's arguments.
+
+    >>> name_flags("FASTConfig.window_px must be odd and at least 1, got 10")
+    '--fast.window-px must be odd and at least 1, got 10'
+    >>> name_flags("min_precision needs the verdict 'score', got 'cardinality' with 0.9")
+    "--min-precision needs --verdict score, got 'cardinality' with 0.9"
+    """
+    for kind, prefix in _sections().items():
+        message = re.sub(rf"\b{kind}\.(\w+)", lambda found, prefix=prefix: _flag(f"{prefix}.{found[1]}"), message)  # type: ignore[misc]
+    names = "|".join(sorted(_arguments(), key=len, reverse=True))
+    message = re.sub(rf"^({names})(?=:? (?!and\b))", lambda found: _flag(found[1]), message)
+    message = re.sub(rf"(?<=; )({names})(?= needs)", lambda found: _flag(found[1]), message)
+    message = re.sub(r"(?<=another file than )(\w+)", lambda found: _flag(found[1]), message)
+    message = re.sub(rf"(?<=must be None beside )({names})\b", lambda found: _flag(found[1]), message)
+    return message.replace("the verdict 'score'", "--verdict score").replace(
+        "consensus=UNRECTIFIED, or the verdict 'cardinality'",
+        "--score consensus --consensus.row-tolerance-px None, or --verdict cardinality",
+    )
+
+
+def _flag(name: str) -> str:
+    return _FILES.get(name, f"--{name.replace('_', '-')}")
+
+
+@cache
+def _sections() -> dict[str, str]:
+    """Prefix of the flags of each nested settings object."""
+    hints = get_type_hints(configs.EvaluationConfig)
+    return {kind.__name__: name for name, kind in hints.items() if isinstance(kind, type) and is_dataclass(kind)}
+
+
+@cache
+def _arguments() -> frozenset[str]:
+    """Names of arguments of the library that are flags or files of the command line."""
+    kinds: list[Any] = [value for value in vars(commands).values() if is_dataclass(value)]
+    found = {field.name for kind in kinds for field in fields(kind)}
+    return frozenset(found | {"source"} - {"config"})

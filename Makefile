@@ -12,7 +12,7 @@ CMAKE := $(BIN)/cmake
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo test check format lint types imports slow kernels sanitize fuzz bench hooks clean
+.PHONY: help dev demo test check format lint types imports slow kernels sanitize fuzz package bench hooks clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -64,6 +64,13 @@ fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFu
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_COMPILER=$(CLANG)
 	$(CMAKE) --build build/fuzz --parallel
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
+
+package: $(READY)  ## Build a wheel, install it into a fresh environment and run it away from the sources
+	rm -rf build/package && mkdir -p build/package/run
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -c $(CONSTRAINTS) -w build/package .
+	$(PYTHON) -m venv build/package/venv
+	build/package/venv/bin/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) build/package/*.whl
+	cd build/package/run && ../venv/bin/tensor-stereo --version && ../venv/bin/tensor-stereo demo --num-pairs 1 --out demo
 
 BENCH_VENV ?= .venv-bench
 SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/scaling \

@@ -40,8 +40,7 @@ def build_graphs(
         tie_tolerance: e in [0, 1), in edge lengths. An edge counts only if its dual Voronoi edge, measured where the
             circle's centre lies within 1 / e edge lengths of the edge's midpoint, is longer than e edge lengths: then
             rounding of the coordinates does not change the graph. 0 gives the exact graph of the given numbers.
-        backend: ``scipy``, ``native``, or ``auto`` for the best one installed; the environment variable
-            ``TENSOR_STEREO_BACKEND`` overrides ``auto``. All give the same bits.
+        backend: a name of :mod:`tensor_stereo.ops.backends`. All give the same bits.
 
     Returns:
         The adjacency, on the device of ``keypoints``. Of coincident points the lowest index is a vertex, the others
@@ -85,8 +84,8 @@ def build_match_graphs(matches: Matches, *, tie_tolerance: float = 1e-3, backend
 
     Args:
         matches: B pairs; ``group`` splits each pair into objects (Restriction 3).
-        tie_tolerance: as in :func:`build_graphs`.
-        backend: as in :func:`build_graphs`.
+        tie_tolerance: e in [0, 1), in edge lengths; see :func:`build_graphs`.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         Both adjacencies and the size of each match's group. No gradient.

@@ -1,9 +1,11 @@
 """The differentiable counterpart of the set tests: how far two Delaunay graphs agree around every match.
 
 An edge of the graph has a dual Voronoi edge of positive length; that length, over a temperature, makes the membership
-soft. Keypoints are differentiable; which points bound a dual edge is not, so gradients have kinks where two points tie
-for it or where both views agree on a pair, and stay finite everywhere. Nothing here is differentiable twice, nor in
-forward mode.
+soft. A link joins two matches that are neighbours in some view, or nearly so; each link has a soft adjacency per view.
+
+Keypoints are differentiable; the choice of the points that bound a dual edge is not. Gradients therefore have kinks
+where two points tie for that choice and where both views agree on a link, and they are finite everywhere. Nothing here
+is differentiable twice, nor in forward mode.
 """
 
 from __future__ import annotations
@@ -17,29 +19,29 @@ from torch.autograd import forward_ad
 from tensor_stereo import ops
 from tensor_stereo.configs import COLDEST, HOTTEST, Backend, TemperatureUnit
 from tensor_stereo.graphs import MatchGraphs
+from tensor_stereo.ops import reference_soft
 from tensor_stereo.types import Adjacency, Matches, check_pairs, check_points, check_tie_tolerance, check_unit
 
 SATURATION = 40.0  # |length / temperature| beyond which an adjacency is constant
-REACH = 16.0  # temperatures of negative length below which a pair counts as blocked; its adjacency is below 1.2e-7
-_TIE = 1e-9  # adjacencies closer than that share the gradient of their minimum
+REACH = 16.0  # temperatures of negative length below which a link counts as blocked; its adjacency is below 1.2e-7
 _UNBOUNDED = 2.0**30  # edge lengths to which dual edges are clipped where the tolerance does not
 
 
-class PairGeometry(NamedTuple):
-    """What bounds the dual Voronoi edges of E pairs of rows in one view."""
+class LinkGeometry(NamedTuple):
+    """What bounds the dual Voronoi edges of E links in one view."""
 
     critical: Tensor  # (E, 2) int64 rows right and left of the way from i to j; -1: none, -2: blocked or out of reach
     is_edge: Tensor  # (E,) bool, of the view's graph
 
 
 class SoftGraphs(NamedTuple):
-    """The graphs of both views of a batch of matches, and all pairs of matches that count softly."""
+    """The graphs of both views of a batch of matches, and all links whose soft adjacency counts."""
 
     graphs: MatchGraphs
-    pairs: Tensor  # (E, 2) int64 rows i < j
-    pair_ptr: Tensor  # (B + 1,) int64 offsets of the pairs
-    view0: PairGeometry
-    view1: PairGeometry
+    links: Tensor  # (E, 2) int64 rows i < j of the matches that each link joins
+    link_ptr: Tensor  # (B + 1,) int64 offsets of the links of each stereo pair
+    view0: LinkGeometry
+    view1: LinkGeometry
 
 
 class SoftCounts(NamedTuple):
@@ -59,31 +61,31 @@ def build_soft_graphs(
     tie_tolerance: float = 1e-3,
     backend: Backend = "auto",
 ) -> SoftGraphs:
-    """The graphs of both views, and the pairs of matches whose soft adjacency counts.
+    """Build the graphs of both views, and find the links whose soft adjacency counts.
 
-    In either view these are the edges of the exact graph; the two critical points of each edge if their segment crosses
-    it, so that an ordinary flip enters and leaves without a jump; and the chords of co-circular polygons with at most
-    16 corners.
+    In either view these are the edges of the exact graph; the two critical points of each edge if the segment between
+    them crosses it, so that an ordinary flip enters and leaves without a jump; and the chords of co-circular polygons
+    with at most 16 corners. Without native kernels every link is compared with every point: 3 s for 1000 matches,
+    growing with the square.
 
     Args:
         matches: B pairs; ``group`` splits each pair into objects.
-        temperature: () above which dual lengths are told apart; pairs :data:`REACH` temperatures below zero count as
-            blocked.
-        unit: ``edge``: in lengths of the pair; ``px``: in pixels.
-        tie_tolerance: as in :func:`tensor_stereo.build_graphs`.
-        backend: as in :func:`tensor_stereo.build_graphs`. Without native kernels all pairs are held against all points:
-            3 s for 1000 matches, growing with the square.
+        temperature: () scale above which dual lengths are told apart. Links whose length is below minus :data:`REACH`
+            temperatures count as blocked.
+        unit: unit of the temperature; ``edge``: lengths of the link, ``px``: pixels.
+        tie_tolerance: tolerance of the graphs in [0, 1), in edge lengths; see :func:`tensor_stereo.build_graphs`.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
-        Graphs and pairs. No gradient.
+        Graphs and links. No gradient.
 
     Raises:
-        ValueError: as :func:`tensor_stereo.graphs.build_match_graphs`, for an unknown ``unit``, or a temperature that
-            is no number between 1e-9 and 1e9.
+        ValueError: for an unknown ``unit``, a temperature that is no number between 1e-9 and 1e9, or what
+            :func:`tensor_stereo.graphs.build_match_graphs` refuses.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
-        >>> build_soft_graphs(Matches(corners, corners, torch.tensor([0, 4]))).pairs.shape
+        >>> build_soft_graphs(Matches(corners, corners, torch.tensor([0, 4]))).links.shape
         torch.Size([6, 2])
     """
     check_unit(unit)
@@ -100,70 +102,72 @@ def build_soft_graphs(
         tie_tolerance,
         backend,
     )
-    crow0, cols0, crow1, cols1, group_size, pairs, pair_ptr, critical0, critical1, is_edge0, is_edge1 = found
+    crow0, cols0, crow1, cols1, group_size, links, link_ptr, critical0, critical1, is_edge0, is_edge1 = found
     adjacencies = Adjacency(crow0, cols0, matches.ptr), Adjacency(crow1, cols1, matches.ptr)
-    views = PairGeometry(critical0, is_edge0), PairGeometry(critical1, is_edge1)
-    return SoftGraphs(MatchGraphs(*adjacencies, group_size), pairs, pair_ptr, *views)
+    views = LinkGeometry(critical0, is_edge0), LinkGeometry(critical1, is_edge1)
+    return SoftGraphs(MatchGraphs(*adjacencies, group_size), links, link_ptr, *views)
 
 
 def dual_critical_points(
-    keypoints: Tensor, ptr: Tensor, pairs: Tensor, group: Tensor | None = None, *, backend: Backend = "auto"
+    keypoints: Tensor, ptr: Tensor, links: Tensor, group: Tensor | None = None, *, backend: Backend = "auto"
 ) -> Tensor:
-    """The points that bound the dual Voronoi edge of given pairs of points.
+    """Find the points that bound the dual Voronoi edges of given links.
 
-    On either side of the line through i and j that is the point which sees the segment under the largest angle: the
-    circle through the three has no other point of that side strictly inside. Of several the lexicographically first.
-    Found exactly, by a walk through the triangles that the segment crosses.
+    On either side of the line through i and j this is the point that sees the segment under the largest angle: the
+    circle through the three has no other point of that side strictly inside. Of several such points it is the
+    lexicographically first. The result is exact.
 
     Args:
         keypoints: (N, 2) float32 or float64 px.
         ptr: (B + 1,) int64 offsets of the images.
-        pairs: (E, 2) int64 rows of two distinct points of one image and group.
+        links: (E, 2) int64 rows of two distinct points of one image and group.
         group: (N,) integer object groups.
-        backend: as in :func:`tensor_stereo.build_graphs`.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         (E, 2) int64 rows, right and left of the way from i to j as seen with y upwards; -1 where that side has no
         point; -2 for both where a point lies between i and j. No gradient.
 
     Raises:
-        ValueError: for pairs that are none, or keypoints as in :func:`tensor_stereo.build_graphs`.
+        ValueError: for links that do not join two distinct points of one image and group, or keypoints that
+            :func:`tensor_stereo.build_graphs` refuses.
 
     Example:
         >>> points = torch.tensor([[0.0, 0.0], [4.0, 0.0], [2.0, 1.0], [2.0, -2.0]])
         >>> dual_critical_points(points, torch.tensor([0, 4]), torch.tensor([[0, 1]]))
         tensor([[3, 2]])
     """
-    found: Tensor = ops.dual_critical_points(keypoints.detach(), ptr, group, pairs, backend)
+    found: Tensor = ops.dual_critical_points(keypoints.detach(), ptr, group, links, backend)
     return found
 
 
 def dual_edge_length(
     keypoints: Tensor,
-    pairs: Tensor,
+    links: Tensor,
     critical: Tensor,
-    pair_ptr: Tensor | None = None,
+    link_ptr: Tensor | None = None,
     *,
     tie_tolerance: float = 1e-3,
     backend: Backend = "auto",
 ) -> Tensor:
-    """Signed length of the dual Voronoi edge of each pair: positive iff it is an edge of the Delaunay graph.
+    """Signed length of the dual Voronoi edge of each link: positive iff it is an edge of the Delaunay graph.
 
-    With i, j the pair, m its midpoint and n its unit normal, the circle around m + t n through both leaves a third
-    point k outside iff a_k t + b_k > 0. The length is the least of these bounds of t from above minus the greatest from
-    below.
+    With i, j the ends of the link, m its midpoint and n its unit normal, the circle around m + t n through both leaves
+    a third point k outside iff a_k t + b_k > 0. The length is the least of these bounds of t from above minus the
+    greatest from below.
 
     Args:
         keypoints: (M, 2) float32 or float64 px.
-        pairs: (E, 2) int64 rows.
-        critical: (E, 2) int64 rows, as :func:`dual_critical_points` gives them.
-        pair_ptr: (K + 1,) int64 offsets of ranges of pairs that share no point; they may run in parallel.
-        tie_tolerance: e; both bounds are clipped to 1 / e lengths of the pair, 2**30 if it is zero.
-        backend: as in :func:`tensor_stereo.build_graphs`.
+        links: (E, 2) int64 rows.
+        critical: (E, 2) int64 rows from :func:`dual_critical_points`.
+        link_ptr: (K + 1,) int64 offsets of ranges of links that share no point; ranges may run in parallel. None: one
+            range.
+        tie_tolerance: e in [0, 1); both bounds are clipped to 1 / e lengths of the link, 2**30 if e is zero.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
-        (E,) float64 px; minus twice the clipped bound where a point lies between. Gradients flow to all four points,
-        and are finite; there is none through a bound that is clipped but for the length of the pair. Not differentiable
+        (E,) float64 px; minus twice the clipped bound where a point lies between. Gradients flow to all four points
+        and are finite. Through a bound that is clipped they flow only to the length of the link. Not differentiable
         twice.
 
     Example:
@@ -172,97 +176,76 @@ def dual_edge_length(
         tensor([0.7500], dtype=torch.float64)
     """
     points = _to_float64("keypoints", keypoints)
-    check_pairs("pairs", pairs, len(points))
-    ratio = _ratio(points, pairs, critical, pair_ptr, tie_tolerance, backend)
-    return ratio * pair_length(points, pairs)
-
-
-def pair_length(keypoints: Tensor, pairs: Tensor) -> Tensor:
-    """(E,) distance of the two points of each pair in px; gradients flow.
-
-    >>> pair_length(torch.tensor([[0.0, 0.0], [3.0, 4.0]]), torch.tensor([[0, 1]]))
-    tensor([5.])
-    """
-    i, j = pairs.unbind(1)
-    length: Tensor = torch.linalg.vector_norm(keypoints.index_select(0, j) - keypoints.index_select(0, i), dim=1)
-    return length
+    check_pairs("links", links, len(points))
+    ratio = _ratio(points, links, critical, link_ptr, tie_tolerance, backend)
+    return ratio * reference_soft.link_length(points, links)
 
 
 def soft_adjacency(
     keypoints: Tensor,
-    pairs: Tensor,
-    geometry: PairGeometry,
+    links: Tensor,
+    geometry: LinkGeometry,
     temperature: Tensor | float = 1.0,
     *,
     unit: TemperatureUnit = "edge",
-    pair_ptr: Tensor | None = None,
+    link_ptr: Tensor | None = None,
     tie_tolerance: float = 1e-3,
     backend: Backend = "auto",
 ) -> Tensor:
-    """How much each pair is an edge: the sigmoid of its dual length over the temperature.
+    """How much each link is an edge of one view: the sigmoid of its dual length over the temperature.
 
     The sign of the length is that of the hard graph, so that the limit of temperature 0 is the hard graph wherever the
     length is not zero; where the tolerance has turned the sign, the gradient is still that of the length itself. At a
-    tie the adjacency is 1/2. |length / temperature| is cut at :data:`SATURATION`.
+    tie the adjacency is 1/2. |length / temperature| is clamped to :data:`SATURATION`.
 
     Args:
         keypoints: (M, 2) float32 or float64 px of one view.
-        pairs: (E, 2) int64 rows.
+        links: (E, 2) int64 rows.
         geometry: critical points and hard edges of that view.
-        temperature: (); positive.
-        unit: ``edge``: in lengths of the pair; ``px``: in pixels.
-        pair_ptr: as in :func:`dual_edge_length`.
-        tie_tolerance: as in :func:`dual_edge_length`.
-        backend: as in :func:`tensor_stereo.build_graphs`.
+        temperature: () positive number.
+        unit: unit of the temperature; ``edge``: lengths of the link, ``px``: pixels.
+        link_ptr: (K + 1,) int64 offsets of ranges of links that share no point; see :func:`dual_edge_length`.
+        tie_tolerance: e in [0, 1), which clips dual lengths; see :func:`dual_edge_length`.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         (E,) float64 in (0, 1). Gradients flow to the keypoints and to the temperature.
 
     Example:
         >>> points = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [1.0, -1.0]])
-        >>> tie = PairGeometry(torch.tensor([[3, 2]]), torch.tensor([False]))
+        >>> tie = LinkGeometry(torch.tensor([[3, 2]]), torch.tensor([False]))
         >>> soft_adjacency(points, torch.tensor([[0, 1]]), tie)
         tensor([0.5000], dtype=torch.float64)
     """
     check_unit(unit)
     points = _to_float64("keypoints", keypoints)
-    check_pairs("pairs", pairs, len(points))
-    length = _ratio(points, pairs, geometry.critical, pair_ptr, tie_tolerance, backend)
+    check_pairs("links", links, len(points))
+    length = _ratio(points, links, geometry.critical, link_ptr, tie_tolerance, backend)
     if unit == "px":
-        length = length * pair_length(points, pairs)
-    with torch.no_grad():  # rounding and the tolerance must not contradict the hard graph, nor turn the gradient
-        signed = torch.where(geometry.is_edge, length.abs(), -length.abs())
-    length = length + (signed - length).detach()
-    return torch.sigmoid((length / _to_temperature(temperature, length.device)).clamp(-SATURATION, SATURATION))
+        length = length * reference_soft.link_length(points, links)
+    value = _to_temperature(temperature, length.device)
+    return reference_soft.soft_adjacency(length, geometry.is_edge, value, SATURATION)
 
 
-def soft_counts(adjacency0: Tensor, adjacency1: Tensor, pairs: Tensor, num_matches: int) -> SoftCounts:
-    """Soft sizes of the neighbour sets of every match, of what they share and of what they hold together.
+def sum_soft_adjacency(adjacency0: Tensor, adjacency1: Tensor, links: Tensor, num_matches: int) -> SoftCounts:
+    """Soft sizes of the neighbour sets of every match, of their intersection and of their union.
 
     Args:
-        adjacency0: (E,) soft adjacency of each pair in view 0.
-        adjacency1: (E,) the same in view 1.
-        pairs: (E, 2) int64 rows.
-        num_matches: M.
+        adjacency0: (E,) soft adjacency of each link in view 0.
+        adjacency1: (E,) soft adjacency of each link in view 1.
+        links: (E, 2) int64 rows.
+        num_matches: number of matches, M.
 
     Returns:
-        Sums of min, max and both adjacencies over the pairs of each match. Gradients flow; where both adjacencies
+        Sums of min, max and both adjacencies over the links of each match. Gradients flow; where both adjacencies
         agree, half to each.
 
     Example:
         >>> half = torch.tensor([0.5])
-        >>> soft_counts(half, 2 * half, torch.tensor([[0, 1]]), 2).union
+        >>> sum_soft_adjacency(half, 2 * half, torch.tensor([[0, 1]]), 2).union
         tensor([1., 1.])
     """
-    # Where both agree, rounding must not decide which of them gets the gradient of the lesser.
-    share = (0.5 + (adjacency1 - adjacency0).detach() / (2 * _TIE)).clamp(0, 1)
-    shared = share * adjacency0 + (1 - share) * adjacency1
-    shared = shared + (torch.minimum(adjacency0, adjacency1) - shared).detach()
-    values = torch.stack([shared, adjacency0, adjacency1], 1)  # (E, 3)
-    zeros = values.new_zeros(num_matches, 3)
-    i, j = pairs.unbind(1)
-    intersection, degree0, degree1 = zeros.index_add(0, i, values).index_add(0, j, values).unbind(1)
-    return SoftCounts(intersection, degree0 + degree1 - intersection, degree0, degree1)
+    return _to_counts(reference_soft.sum_adjacency(adjacency0, adjacency1, links, num_matches))
 
 
 def count_soft_neighbors(
@@ -274,18 +257,18 @@ def count_soft_neighbors(
     tie_tolerance: float = 1e-3,
     backend: Backend = "auto",
 ) -> SoftCounts:
-    """:func:`soft_adjacency` in both views and :func:`soft_counts`, where there are native kernels in one pass.
+    """Compute :func:`soft_adjacency` in both views and :func:`sum_soft_adjacency` in one pass.
 
     Args:
-        matches: as in :func:`build_soft_graphs`.
-        found: what it has found.
-        temperature: (); positive.
-        unit: as in :func:`build_soft_graphs`.
-        tie_tolerance: as in :func:`build_soft_graphs`.
-        backend: as in :func:`tensor_stereo.build_graphs`.
+        matches: B pairs, M matches.
+        found: the result of :func:`build_soft_graphs` for these matches.
+        temperature: () positive number.
+        unit: unit of the temperature; ``edge``: lengths of the link, ``px``: pixels.
+        tie_tolerance: e in [0, 1), which clips dual lengths; see :func:`dual_edge_length`.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
-        Gradients flow to both keypoints and the temperature, and are finite. Not differentiable twice.
+        The counts. Gradients flow to both keypoints and the temperature, and are finite. Not differentiable twice.
 
     Example:
         >>> corners = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
@@ -294,38 +277,27 @@ def count_soft_neighbors(
         tensor([True, True, True, True])
     """
     check_unit(unit)
-    views = (("keypoints0", matches.keypoints0, found.view0), ("keypoints1", matches.keypoints1, found.view1))
-    if ops.resolve_backend(backend) == "scipy":
-        adjacency0, adjacency1 = (
-            soft_adjacency(
-                keypoints,
-                found.pairs,
-                view,
-                temperature,
-                unit=unit,
-                pair_ptr=found.pair_ptr,
-                tie_tolerance=tie_tolerance,
-                backend=backend,
-            )
-            for _, keypoints, view in views
-        )
-        return soft_counts(adjacency0, adjacency1, found.pairs, matches.num_matches)
-    points0, points1 = (_to_float64(name, keypoints) for name, keypoints, _ in views)
-    counts = ops.soft_counts(
+    points0, points1 = _to_float64("keypoints0", matches.keypoints0), _to_float64("keypoints1", matches.keypoints1)
+    sums = ops.soft_counts(
         points0,
         points1,
-        found.pairs,
+        found.links,
         found.view0.critical,
         found.view1.critical,
         found.view0.is_edge,
         found.view1.is_edge,
-        found.pair_ptr,
+        found.link_ptr,
         _to_temperature(temperature, points0.device),
         SATURATION,
         unit == "px",
         _bound(tie_tolerance),
+        backend,
     )
-    intersection, degree0, degree1 = counts.unbind(1)
+    return _to_counts(sums)
+
+
+def _to_counts(sums: Tensor) -> SoftCounts:
+    intersection, degree0, degree1 = sums.unbind(1)
     return SoftCounts(intersection, degree0 + degree1 - intersection, degree0, degree1)
 
 
@@ -357,11 +329,11 @@ def _divide(part: Tensor, whole: Tensor) -> Tensor:
 
 
 def _ratio(
-    points: Tensor, pairs: Tensor, critical: Tensor, pair_ptr: Tensor | None, tie_tolerance: float, backend: Backend
+    points: Tensor, links: Tensor, critical: Tensor, link_ptr: Tensor | None, tie_tolerance: float, backend: Backend
 ) -> Tensor:
-    if pair_ptr is None:
-        pair_ptr = torch.tensor([0, len(pairs)], device=pairs.device)
-    ratio: Tensor = ops.dual_edge_ratio(points, pairs, critical, pair_ptr, _bound(tie_tolerance), backend)
+    if link_ptr is None:
+        link_ptr = torch.tensor([0, len(links)], device=links.device)
+    ratio: Tensor = ops.dual_edge_ratio(points, links, critical, link_ptr, _bound(tie_tolerance), backend)
     return ratio
 
 

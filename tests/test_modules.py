@@ -220,6 +220,7 @@ def test_unrectified_pairs_and_negative_disparities_are_like_any_other() -> None
         assert torch.allclose(output.score, expected.score, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [

@@ -7,23 +7,23 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 import tensor_stereo as ts
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.soft import (
-    PairGeometry,
+    LinkGeometry,
     SoftCounts,
     build_soft_graphs,
     count_soft_neighbors,
     dual_critical_points,
     dual_edge_length,
     soft_adjacency,
-    soft_counts,
     soft_jaccard,
     soft_overlap,
+    sum_soft_adjacency,
 )
 from tests.oracles import installed_backends
 from tests.point_sets import GENERATORS, distinct_points
@@ -45,10 +45,10 @@ def _matches(kind: str, seed: int, n: int, wrong: float = 0.4) -> ts.Matches:
 def _counts(matches: ts.Matches, temperature: float, unit: str = "edge", backend: str = "auto") -> SoftCounts:
     found = build_soft_graphs(matches, temperature, unit=unit, backend=backend)
     adjacencies = [
-        soft_adjacency(points, found.pairs, view, temperature, unit=unit, backend=backend)
+        soft_adjacency(points, found.links, view, temperature, unit=unit, backend=backend)
         for points, view in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1))
     ]
-    return soft_counts(*adjacencies, found.pairs, matches.num_matches)
+    return sum_soft_adjacency(*adjacencies, found.links, matches.num_matches)
 
 
 def _length_by_definition(points: np.ndarray, i: int, j: int, bound: float) -> float:
@@ -66,26 +66,31 @@ def _length_by_definition(points: np.ndarray, i: int, j: int, bound: float) -> f
             low = max(low, -offset / slope)
         else:
             high = min(high, -offset / slope)
-    return float(high - low)
+    return float(max(high, -bound * length) - min(low, bound * length))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @given(st.integers(0, 10**6), st.integers(3, 25), st.sampled_from(["edge", "px"]), st.sampled_from([0.3, 1.0, 4.0]))
+@example(2840, 5, "edge", 0.3)
+@example(198, 24, "edge", 0.3)
 def test_counts_are_those_of_the_definition(backend: str, seed: int, n: int, unit: str, temperature: float) -> None:
     matches = _matches("uniform", seed, n)
     found = build_soft_graphs(matches, temperature, unit=unit, backend=backend)
     expected = np.zeros((n, 3))
-    for i, j in found.pairs.tolist():
+    for i, j in found.links.tolist():
         soft = []
         for points in (matches.keypoints0.numpy(), matches.keypoints1.numpy()):
-            scale = temperature * (math.dist(points[i], points[j]) if unit == "edge" else 1)
-            soft.append(1 / (1 + math.exp(-min(max(_length_by_definition(points, i, j, 1e3) / scale, -40), 40))))
+            edge, length = math.dist(points[i], points[j]), _length_by_definition(points, i, j, 1e3)
+            if 0 < length <= 1e-3 * edge:  # no edge of the graph, by its tolerance
+                length = -length
+            scale = temperature * (edge if unit == "edge" else 1)
+            soft.append(1 / (1 + math.exp(-min(max(length / scale, -40), 40))))
         for row in (i, j):
             expected[row] += (min(soft), *soft)
     counts = _counts(matches, temperature, unit, backend)
     assert torch.stack([counts.intersection, counts.degree0, counts.degree1], 1).numpy() == pytest.approx(
         expected, abs=2e-6 * n
-    )  # pairs beyond the reach of 16 temperatures count as 40: 1.2e-7 each
+    )  # links beyond the reach of 16 temperatures count as 40: 1.2e-7 each
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -94,8 +99,8 @@ def test_limit_of_temperature_zero_is_the_hard_graph(backend: str, kind: str, se
     matches = _matches(kind, seed, n)
     found = build_soft_graphs(matches, backend=backend)
     for points, view in ((matches.keypoints0, found.view0), (matches.keypoints1, found.view1)):
-        length = dual_edge_length(points, found.pairs, view.critical, backend=backend)
-        edge = (points[found.pairs[:, 0]] - points[found.pairs[:, 1]]).norm(dim=1)
+        length = dual_edge_length(points, found.links, view.critical, backend=backend)
+        edge = (points[found.links[:, 0]] - points[found.links[:, 1]]).norm(dim=1)
         assume(bool((length.abs() > 1e-6 * edge).all()))
     counts = _counts(matches, 1e-8, backend=backend)
     graphs = build_match_graphs(matches, backend=backend)
@@ -135,10 +140,10 @@ def test_gradient_equals_finite_differences_in_general_position(backend: str, un
 
     def score(k0: torch.Tensor, k1: torch.Tensor, temperature: torch.Tensor) -> torch.Tensor:
         adjacencies = [
-            soft_adjacency(points, found.pairs, view, temperature, unit=unit, pair_ptr=found.pair_ptr, backend=backend)
+            soft_adjacency(points, found.links, view, temperature, unit=unit, link_ptr=found.link_ptr, backend=backend)
             for points, view in ((k0, found.view0), (k1, found.view1))
         ]
-        counts = soft_counts(*adjacencies, found.pairs, n)
+        counts = sum_soft_adjacency(*adjacencies, found.links, n)
         return torch.cat([soft_jaccard(counts), soft_overlap(counts)])
 
     temperature = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
@@ -157,12 +162,12 @@ def test_length_has_a_gradient_to_all_four_points_without_hull_edges(backend: st
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(40, 2, dtype=torch.float64, generator=generator)
     ptr = torch.tensor([0, 40])
-    pairs = build_soft_graphs(ts.Matches(points, points, ptr)).pairs
-    critical = dual_critical_points(points, ptr, pairs, backend=backend)
+    links = build_soft_graphs(ts.Matches(points, points, ptr)).links
+    critical = dual_critical_points(points, ptr, links, backend=backend)
     inner = (critical >= 0).all(1)
-    pairs, critical = pairs[inner], critical[inner]
+    links, critical = links[inner], critical[inner]
     assert torch.autograd.gradcheck(
-        lambda p: dual_edge_length(p, pairs, critical, backend=backend), points.requires_grad_()
+        lambda p: dual_edge_length(p, links, critical, backend=backend), points.requires_grad_()
     )
 
 
@@ -253,7 +258,7 @@ def test_large_co_circular_polygons_take_no_cubic_time(backend: str) -> None:
     assert len(corners) == 108
     points = torch.tensor(corners, dtype=torch.float64)
     found = build_soft_graphs(ts.Matches(points, points, torch.tensor([0, 108])), backend=backend)
-    assert len(found.pairs) == 108  # the sides alone: its 5670 chords are not listed
+    assert len(found.links) == 108  # the sides alone: its 5670 chords are not listed
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, math.nan, math.inf, 1e-200])
@@ -267,7 +272,7 @@ def test_a_temperature_out_of_range_is_refused(temperature: float) -> None:
         count_soft_neighbors(matches, build_soft_graphs(matches), torch.full((1,), temperature))
 
 
-def test_bad_pairs_and_tolerances_are_refused() -> None:
+def test_bad_links_and_tolerances_are_refused() -> None:
     points, critical = torch.rand(3, 2), torch.tensor([[-1, 2]])
     with pytest.raises(ValueError, match="rows 0"):
         dual_edge_length(points, torch.tensor([[0, 9]]), critical)
@@ -284,10 +289,10 @@ def test_the_two_diagonals_of_a_flip_change_places_without_a_jump() -> None:
         moved = left.clone()
         moved[2, 0] += shift
         found = build_soft_graphs(ts.Matches(moved, left.flip(0), torch.tensor([0, 6])), tie_tolerance=0)
-        adjacency = soft_adjacency(moved, found.pairs, found.view0, tie_tolerance=0)
-        place = {tuple(pair): k for k, pair in enumerate(found.pairs.tolist())}
+        adjacency = soft_adjacency(moved, found.links, found.view0, tie_tolerance=0)
+        place = {tuple(link): k for k, link in enumerate(found.links.tolist())}
         diagonals.append(adjacency[[place[0, 2], place[1, 3]]])
-        edges.append(found.pairs[found.view0.is_edge].tolist())
+        edges.append(found.links[found.view0.is_edge].tolist())
     first, last = ([[0, 2] in e, [1, 3] in e] for e in (edges[0], edges[-1]))
     assert first != last  # they do change places
     assert sum(first) == sum(last) == 1
@@ -304,7 +309,7 @@ def test_no_neighbour_scores_zero() -> None:
 
 def test_half_precision_keypoints_are_refused() -> None:
     points = torch.rand(3, 2)
-    tie = PairGeometry(torch.tensor([[-1, 2]]), torch.tensor([True]))
+    tie = LinkGeometry(torch.tensor([[-1, 2]]), torch.tensor([True]))
     for dtype in (torch.float16, torch.bfloat16):
         with pytest.raises(TypeError, match="keypoints"):
             soft_adjacency(points.to(dtype), torch.tensor([[0, 1]]), tie)

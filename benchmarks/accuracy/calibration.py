@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from shared.calibration_error import calibration_error
-from shared.harness import Suite
 
 import tensor_stereo as ts
 from accuracy.putatives import Putatives, to_images, to_matches
+from shared.calibration_error import calibration_error
+from shared.harness import Suite
 from tensor_stereo.classification import classify_graphs
 from tensor_stereo.evaluation import match_rates
 from tensor_stereo.graphs import build_match_graphs

@@ -22,12 +22,11 @@ from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import LearnedScore, consensus_belief, load_learned, measure_images
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
-from shared.harness import Suite
-from training.work_folder import load_fold_networks
-
 from accuracy.dense_figures import draw_bars, draw_maps
 from accuracy.peers import score_disparity, score_lpm
 from accuracy.putatives import GrayPair, Putatives, find_putatives, load_pairs, to_matches
+from shared.harness import Suite
+from training.work_folder import load_fold_networks
 
 DETECTORS = ("sift", "fast", "gftt")
 BAD_PX = 2.0

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from shared.scenes import GATES
 
 import tensor_stereo as ts
+from shared.scenes import GATES
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.datasets import SyntheticDataset, find_pairs, read_pair
 from tensor_stereo.evaluation import matches_against_gt

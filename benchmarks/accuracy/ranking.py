@@ -10,11 +10,9 @@ import cv2
 import numpy as np
 import torch
 
-from tensor_stereo.evaluation.metrics import roc_curve, roc_update
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, roc_curve, roc_update
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
-from shared.harness import Suite
-
 from accuracy.calibration import report_calibration
 from accuracy.peers import score_peers
 from accuracy.putatives import (
@@ -27,8 +25,8 @@ from accuracy.putatives import (
 )
 from accuracy.ranking_figures import draw_degradation, draw_roc
 from accuracy.scores import OURS, score_ours
+from shared.harness import Suite
 
-SENSITIVITY = 0.96
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # share of the matches that get a random partner
 SIGMAS_PX = (0.0, 0.25, 0.5, 1.0, 2.0)
 GRID = np.linspace(0, 1, 51)  # sensitivities of the stored ROC curves
@@ -48,7 +46,7 @@ def measure(found: list[Putatives], *, has_cost: bool = True) -> tuple[Figures, 
             if not bool(torch.isfinite(score).all()):  # else the scene would drop out unseen
                 raise ValueError(f"score {name!r} of {one.scene} is not finite")
             counts = roc_update(score, correct, valid=valid)
-            figures.setdefault(name, []).append((counts.auc(), counts.specificity_at(SENSITIVITY)))
+            figures.setdefault(name, []).append((counts.auc(), counts.specificity_at(PAPER_SENSITIVITY)))
             curve = roc_curve(score, correct, valid=valid)
             curves.setdefault(name, []).append(np.interp(GRID, curve.sensitivity, curve.specificity))
     return {k: np.array(v) for k, v in figures.items()}, {k: np.array(v) for k, v in curves.items()}

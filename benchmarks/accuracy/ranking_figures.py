@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from shared.figures import plt, save_figure
 
 from accuracy.scores import OURS
+from shared.figures import plt, save_figure
 
 SHOWN = ("Jaccard of neighbours", "LPM", "libviso2 support", "disparity median, Delaunay", "AdaLAM", *OURS)
 

@@ -20,12 +20,11 @@ import tensor_stereo as ts
 from tensor_stereo.datasets import SyntheticDataset
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
-from shared.results import write_records
-from shared.scenes import EIGHT, read_pairs
-
 from experiments.disparity_network import TrainedNet, TrainingConfig, train
 from experiments.pseudo_labels import CONDITIONS, PseudoLabels, make_pseudo_labels
 from experiments.subpixel_refinement import RefinementConfig, refine_pairs
+from shared.results import write_records
+from shared.scenes import EIGHT, read_pairs
 
 HELD_OUT = ("Baby1", "Midd1")  # of the 2006 release: every setting was chosen on them and on rendered pairs
 TRAINING_SEED, TEST_SEED = 1, 2  # of the rendered pairs

@@ -12,7 +12,6 @@ import tensor_stereo as ts
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.harness import Suite
 from shared.points import matched_batch, matched_points
-
 from speed.python_sets import classify_with_sets
 
 PAIRS, COUNT = 64, 1000

@@ -17,7 +17,6 @@ from tensor_stereo.pipeline import run_pipeline
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.harness import Suite
 from shared.scenes import EIGHT, GATES, read_pairs
-
 from speed.python_sets import classify_with_sets
 
 

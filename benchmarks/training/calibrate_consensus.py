@@ -25,7 +25,6 @@ from tensor_stereo.scores import calibrate_consensus, consensus_belief
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.calibration_error import calibration_error
-
 from training.platt_scaling import fit_calibration
 from training.work_folder import FOLDS, load_records
 

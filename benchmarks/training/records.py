@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from shared.scenes import GATES
 from torch import Tensor
 
+from shared.scenes import GATES
 from tensor_stereo.configs import (
     Detector,
     FASTConfig,

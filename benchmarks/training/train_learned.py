@@ -27,7 +27,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional
 
-from tensor_stereo.evaluation.metrics import roc_update
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, roc_update
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import LearnedScore
 from tensor_stereo.scores.learned_inputs import Quantities, find_receivers, measure_quantities
@@ -41,7 +41,6 @@ SEED, EPOCHS, PAIRS_AT_ONCE = 0, 6, 8
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-3
 DROP_IMAGE, DROP_COST = 0.15, 0.30  # share of the pairs that are shown without
 BELIEF_WEIGHT = 0.2  # of the loss on the beliefs between rounds
-SENSITIVITY = 0.96
 
 
 class Item(NamedTuple):
@@ -164,7 +163,7 @@ def cross_validate(work: Path, fold: int | None) -> dict[str, object]:
                 logit, correct = predict(network, item, shown)
                 key = f"{name}: {record.detector}{', gated' if record.gated else ''}"
                 counts = roc_update(logit, correct)
-                figures[key].append((counts.auc(), counts.specificity_at(SENSITIVITY)))
+                figures[key].append((counts.auc(), counts.specificity_at(PAPER_SENSITIVITY)))
     print(f"fold {fold}: {time.perf_counter() - start:.0f} s", flush=True)
     left_out = [torch.cat(x) if x else torch.zeros(0) for x in (logits, truths, weights)]
     return {"figures": dict(figures), "left out": left_out, "weights": network.state_dict()}

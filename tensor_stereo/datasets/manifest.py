@@ -45,7 +45,7 @@ def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -
 
     Raises:
         FileNotFoundError, NotADirectoryError: if a root or a listed file is missing.
-        ValueError: if there is no root, a list is wrong (naming file, row and column), two different pairs share
+        ValueError: if there is no root, a list is wrong (naming file, line and column), two different pairs share
             dataset and scene, or as :func:`~tensor_stereo.datasets.find_pairs`.
 
     >>> import tempfile
@@ -112,7 +112,7 @@ def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no Parquet file, or an entry is wrong; the message names file, row (from 0) and column.
+        ValueError: if it is no Parquet file, or an entry is wrong; the message names file, row (from 1) and column.
     """
     path = Path(path)
     if not path.is_file():
@@ -138,20 +138,20 @@ def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool)
     """One checked row."""
     for name in _REQUIRED:
         if values[name] is None or values[name] == "":
-            raise ValueError(f"{path}, row {row}: column {name!r} is empty")
+            raise ValueError(f"{path}, row {row + 1}: column {name!r} is empty")
     for name in ("width_px", "height_px"):
         if not int(str(values[name])) > 0:
-            raise ValueError(f"{path}, row {row}: column {name!r} must be positive, got {values[name]}")
+            raise ValueError(f"{path}, row {row + 1}: column {name!r} must be positive, got {values[name]}")
     scale = values["gt_scale"]
     if scale is not None and not (isinstance(scale, float) and 0 < scale < math.inf):
-        raise ValueError(f"{path}, row {row}: column 'gt_scale' must be positive and finite, got {scale}")
+        raise ValueError(f"{path}, row {row + 1}: column 'gt_scale' must be positive and finite, got {scale}")
     encoding = str(values["gt_encoding"])
     if encoding not in GT_ENCODINGS:
-        raise ValueError(f"{path}, row {row}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}")
+        raise ValueError(f"{path}, row {row + 1}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}")
     paths = {name: None if values[name] is None else Path(str(values[name])) for name in _PATHS}
     for name, file in paths.items():
         if check_files and file is not None and not file.is_file():
-            raise ValueError(f"{path}, row {row}: column {name!r} names {file}, which is no file")
+            raise ValueError(f"{path}, row {row + 1}: column {name!r} names {file}, which is no file")
     return PairFiles(str(values["dataset"]), str(values["scene"]), gt_scale=scale, gt_encoding=encoding, **paths)  # type: ignore[arg-type]
 
 
@@ -173,22 +173,24 @@ def _read_list(path: Path) -> list[PairFiles]:
     for row, values in enumerate(table.iter_rows(named=True)):
         for name in _LISTED:
             if not values[name]:
-                raise ValueError(f"{path}, row {row}: column {name!r} is empty")
+                raise ValueError(f"{path}, line {row + 2}: column {name!r} is empty")
         paths = {name: path.parent / values[name] for name in _PATHS if values.get(name)}
         for name, file in paths.items():
             if not file.is_file():
-                raise FileNotFoundError(f"{path}, row {row}: column {name!r} names {file}, which is no file")
+                raise FileNotFoundError(f"{path}, line {row + 2}: column {name!r} names {file}, which is no file")
         try:
             scale = float(values["gt_scale"]) if values.get("gt_scale") else None
             check_gt_scale(scale)
         except ValueError as error:
-            raise ValueError(f"{path}, row {row}: column 'gt_scale': {error}") from error
+            raise ValueError(f"{path}, line {row + 2}: column 'gt_scale': {error}") from error
         encoding = values.get("gt_encoding") or "scaled"
         if encoding not in GT_ENCODINGS:
-            raise ValueError(f"{path}, row {row}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}")
+            raise ValueError(
+                f"{path}, line {row + 2}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}"
+            )
         disparity = paths.get("disparity_gt")
         if disparity is not None and scale is None and encoding == "scaled" and disparity.suffix.casefold() != ".pfm":
-            raise ValueError(f"{path}, row {row}: column 'gt_scale' is empty, but {disparity} is no PFM file")
+            raise ValueError(f"{path}, line {row + 2}: column 'gt_scale' is empty, but {disparity} is no PFM file")
         dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
         pairs.append(PairFiles(dataset, scene, gt_scale=scale, gt_encoding=encoding, **paths))
     return pairs

@@ -1,7 +1,8 @@
-"""Pairs of points whose soft adjacency counts, and the points that bound their dual Voronoi edges.
+"""Links whose soft adjacency counts, and the points that bound their dual Voronoi edges.
 
-The critical point of a pair {i, j} on one side of its line is the one that sees the segment under the largest angle, of
-several the lexicographically first. Here it is found among all points of the segment.
+A link joins two points that are neighbours, or nearly so. The critical point of a link {i, j} on one side of its line
+is the one that sees the segment under the largest angle, of several the lexicographically first. Here it is searched
+among all points of the segment.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from tensor_stereo.delaunay.predicates import Float, incircle, orientation
 
 BLOCKED = -2  # a point lies between the two, or the dual edge is out of reach
 MOST_CORNERS = 16  # the chords of larger co-circular polygons are not listed: there are too many
-_CHUNK = 2**18  # pairs x points that are compared at a time
+_CHUNK = 2**18  # links x points that are compared at a time
 
 
-def soft_pairs(views: list[Float], ptr: Int, *, num_threads: int) -> tuple[Int, Int]:
-    """Pairs that count in at least one of several point sets over the same segments.
+def soft_links(views: list[Float], ptr: Int, *, num_threads: int) -> tuple[Int, Int]:
+    """Links that count in at least one of several point sets over the same segments.
 
-    They are the edges of the exact graphs, for each edge with critical points on both sides that pair if it crosses the
-    edge, and the chords of co-circular polygons with at most ``MOST_CORNERS`` corners.
+    They are the edges of the exact graphs; the two critical points of each edge if the segment between them crosses it;
+    and the chords of co-circular polygons with at most ``MOST_CORNERS`` corners.
 
     Args:
         views: (N, 2) float64 each.
@@ -30,22 +31,22 @@ def soft_pairs(views: list[Float], ptr: Int, *, num_threads: int) -> tuple[Int, 
         num_threads: threads that share the segments.
 
     Returns:
-        pairs (E, 2) int64, i < j, ascending, and their offsets (S + 1,).
+        links (E, 2) int64, i < j, ascending, and their offsets (S + 1,).
     """
     found = [np.empty((0, 2), dtype=np.int64)]
     for points in views:
-        found += map_blocks(_block_pairs, points, ptr, num_threads)
+        found += map_blocks(_block_links, points, ptr, num_threads)
     both = np.sort(np.concatenate(found), axis=1)
-    pairs = np.unique(both, axis=0)
-    return pairs, np.searchsorted(pairs[:, 0], ptr)
+    links = np.unique(both, axis=0)
+    return links, np.searchsorted(links[:, 0], ptr)
 
 
-def _block_pairs(points: Float, ptr: Int) -> Int:
+def _block_links(points: Float, ptr: Int) -> Int:
     meshes, paths = certified_meshes(points, ptr)
-    return np.concatenate([paths, *(part for mesh in meshes for part in _mesh_pairs(points, mesh))])
+    return np.concatenate([paths, *(part for mesh in meshes for part in _mesh_links(points, mesh))])
 
 
-def _mesh_pairs(points: Float, mesh: Mesh) -> list[Int]:
+def _mesh_links(points: Float, mesh: Mesh) -> list[Int]:
     is_strict = mesh.side < 0
     opposite = canonical_opposite(points, mesh)
     inner = is_strict & (opposite != HULL).all(1)
@@ -63,14 +64,14 @@ def _mesh_pairs(points: Float, mesh: Mesh) -> list[Int]:
     return found
 
 
-def critical_points(points: Float, ptr: Int, pairs: Int, pair_ptr: Int) -> Int:
-    """Critical points of given pairs of vertices, from all points of their segment.
+def critical_points(points: Float, ptr: Int, links: Int, link_ptr: Int) -> Int:
+    """Critical points of given links, searched among all points of their segment.
 
     Args:
         points: (N, 2) float64, distinct within a segment.
         ptr: (S + 1,) offsets of the segments.
-        pairs: (E, 2) rows of points.
-        pair_ptr: (S + 1,) offsets of the pairs of each segment.
+        links: (E, 2) rows of the two points that each link joins.
+        link_ptr: (S + 1,) offsets of the links of each segment.
 
     Returns:
         (E, 2) rows of points, right and left of the way from the first vertex to the second; -1 where that side is
@@ -81,33 +82,33 @@ def critical_points(points: Float, ptr: Int, pairs: Int, pair_ptr: Int) -> Int:
         >>> critical_points(corners, np.array([0, 4]), np.array([[0, 1], [0, 2]]), np.array([0, 2])).tolist()
         [[-1, 3], [1, 3]]
     """
-    found = np.empty_like(pairs)
-    for s in np.flatnonzero(np.diff(pair_ptr)):
+    found = np.empty_like(links)
+    for s in np.flatnonzero(np.diff(link_ptr)):
         members = points[ptr[s] : ptr[s + 1]]
         step = max(1, _CHUNK // len(members))
-        for start in range(pair_ptr[s], pair_ptr[s + 1], step):
-            rows = slice(start, min(start + step, pair_ptr[s + 1]))
-            local = _search(members, pairs[rows] - ptr[s])
+        for start in range(link_ptr[s], link_ptr[s + 1], step):
+            rows = slice(start, min(start + step, link_ptr[s + 1]))
+            local = _search(members, links[rows] - ptr[s])
             found[rows] = np.where(local < 0, local, local + ptr[s])
     return found
 
 
-def _search(points: Float, pairs: Int) -> Int:
-    i, j = points[pairs[:, 0]], points[pairs[:, 1]]
+def _search(points: Float, links: Int) -> Int:
+    i, j = points[links[:, 0]], points[links[:, 1]]
     dx, dy = (j - i).T[:, :, None]  # (E, 1)
     x, y = (points[None] - i[:, None]).transpose(2, 0, 1)  # (E, n)
     cross, along = dx * y - dy * x, x * (x - dx) + y * (y - dy)
     is_third = np.ones(cross.shape, dtype=bool)
-    is_third[np.arange(len(pairs))[:, None], pairs] = False
+    is_third[np.arange(len(links))[:, None], links] = False
     side = np.sign(cross).astype(np.int8)
     unsure = is_third & ~(np.abs(cross) > 1e-14 * (np.abs(dx * y) + np.abs(dy * x)))
-    pair, point = np.nonzero(unsure)
-    side[pair, point] = orientation(i[pair], j[pair], points[point])
+    link, point = np.nonzero(unsure)
+    side[link, point] = orientation(i[link], j[link], points[point])
     with np.errstate(all="ignore"):
         end = along / (2 * np.abs(cross))
         reach, span = np.abs(x) + np.abs(y), np.abs(dx) + np.abs(dy)
         error = 1e-15 * reach * (reach + (1 + 2 * np.abs(end)) * span) / np.abs(cross)
-    found = [_best(points, pairs, is_third & (side == sign), end, error, sign) for sign in (-1, 1)]
+    found = [_best(points, links, is_third & (side == sign), end, error, sign) for sign in (-1, 1)]
     result = np.stack(found, 1)
     low, high = np.minimum(i, j)[:, None], np.maximum(i, j)[:, None]  # products may round, comparisons do not
     is_between = ((points[None] >= low) & (points[None] <= high)).all(2)
@@ -115,14 +116,14 @@ def _search(points: Float, pairs: Int) -> Int:
     return result
 
 
-def _best(points: Float, pairs: Int, candidate: NDArray[np.bool_], end: Float, error: Float, sign: int) -> Int:
+def _best(points: Float, links: Int, candidate: NDArray[np.bool_], end: Float, error: Float, sign: int) -> Int:
     """The candidates with the smallest ``end``; exact predicates decide what ``error`` leaves open."""
     with np.errstate(all="ignore"):
         upper = np.where(candidate, np.where(np.isnan(end + error), np.inf, end + error), np.inf)
         near = candidate & ~(end - error > upper.min(1, keepdims=True, initial=np.inf))
     order = np.argsort(~near, axis=1, kind="stable")
     best = np.where(near.any(1), order[:, 0], HULL)
-    a, b = pairs[:, 0], pairs[:, 1]
+    a, b = links[:, 0], links[:, 1]
     if sign < 0:
         a, b = b, a
     for k in range(1, int(near.sum(1).max(initial=0))):
@@ -136,10 +137,10 @@ def _best(points: Float, pairs: Int, candidate: NDArray[np.bool_], end: Float, e
     return best
 
 
-def limit_reach(points: Float, pairs: Int, critical: Int, *, edge_lengths: float, px: float) -> Int:
-    """Mark as blocked what has a dual length below minus (``edge_lengths`` times its length plus ``px``)."""
+def limit_reach(points: Float, links: Int, critical: Int, *, edge_lengths: float, px: float) -> Int:
+    """Mark links as blocked whose dual length is below minus (``edge_lengths`` times their length plus ``px``)."""
     between = np.flatnonzero((critical >= 0).all(1))
-    i, j = (points[pairs[between, k]] for k in (0, 1))
+    i, j = (points[links[between, k]] for k in (0, 1))
     dx, dy = (j - i).T
     least = []  # ends less what rounding may have added to them
     with np.errstate(all="ignore"):

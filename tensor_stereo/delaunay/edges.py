@@ -34,7 +34,7 @@ def delaunay_edges(points: Float, ptr: Int, *, tie_tolerance: float, num_threads
         num_threads: threads that share the segments.
 
     Returns:
-        (E, 2) int64 pairs of global point indices, each edge once, in no particular order.
+        (E, 2) int64 global indices of the ends, each edge once, in no particular order.
 
     Example:
         >>> import numpy as np

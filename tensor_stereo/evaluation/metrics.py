@@ -15,13 +15,15 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.sampling import sample_nearest
-from tensor_stereo.types import Matches, check_vector
+from tensor_stereo.types import Matches, check_mask, check_vector
+
+PAPER_SENSITIVITY, PAPER_SPECIFICITY = 0.96, 0.70  # Bustos, Vargas & Trujillo, CIARP 2016, in words
 
 
 def matches_against_gt(
     matches: Matches, disparity_gt: Tensor | Sequence[Tensor], *, max_error_px: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Hold the disparity of every match against ground truth at the nearest pixel of its left keypoint.
+    """Compare the disparity of every match with ground truth at the nearest pixel of its left keypoint.
 
     Coordinates are rounded half to even; keypoints up to 1 px outside the image read the border. No gradient.
 
@@ -180,7 +182,7 @@ class MatchRates:
         self.confusion = Confusion()
 
     def update(self, inlier: Tensor, correct: Tensor, valid: Tensor) -> None:
-        """Add the verdicts of some matches, as :func:`confusion_update` takes them."""
+        """Add the verdicts of some matches; the arguments are those of :func:`confusion_update`."""
         self.confusion += confusion_update(inlier, correct, valid)
 
     def merge(self, other: MatchRates) -> None:
@@ -232,7 +234,7 @@ class ScoreCounts:
         return ScoreCounts(score, *both.new_zeros(len(score), 2).index_add(0, row, both).unbind(1))
 
     def curve(self) -> ROC:
-        """The ROC curve, as :func:`roc_curve`."""
+        """The ROC curve; see :func:`roc_curve`."""
         none = self.num_correct.new_zeros(1)
         rejected = torch.cat([none, self.num_incorrect.cumsum(0)]).double()
         lost = torch.cat([none, self.num_correct.cumsum(0)])
@@ -241,14 +243,14 @@ class ScoreCounts:
         return ROC(threshold, rejected / rejected[-1], kept / kept[0])
 
     def auc(self) -> float:
-        """The area under the ROC curve, as :func:`roc_auc`."""
+        """The area under the ROC curve; see :func:`roc_auc`."""
         below = self.num_incorrect.cumsum(0) - self.num_incorrect
-        # pairs (correct, incorrect) in the right order count 2, ties 1: an integer, hence exact
+        # every correct match counts 2 for each incorrect one below it and 1 for each tie: an integer, hence exact
         doubled = int((self.num_correct * (2 * below + self.num_incorrect)).sum())
         return _ratio(doubled, 2 * int(self.num_correct.sum()) * int(self.num_incorrect.sum()))
 
     def specificity_at(self, sensitivity: float) -> float:
-        """The specificity where the sensitivity is reached, as :func:`specificity_at_sensitivity`."""
+        """The specificity where the sensitivity is reached; see :func:`specificity_at_sensitivity`."""
         if not 0 <= sensitivity <= 1:
             raise ValueError(f"sensitivity must lie in 0..1, got {sensitivity}")
         num_correct, num_incorrect = int(self.num_correct.sum()), int(self.num_incorrect.sum())
@@ -294,10 +296,8 @@ def roc_update(score: Tensor, correct: Tensor, *, valid: Tensor | None = None) -
 def roc_curve(score: Tensor, correct: Tensor, *, valid: Tensor | None = None) -> ROC:
     """ROC curve of a score; equal scores are rejected together.
 
-    Arguments and errors are those of :func:`roc_update`.
-
-    Returns:
-        One operating point per distinct score, and one that rejects nothing. No gradient.
+    The result has one operating point per distinct score, and one that rejects nothing. No gradient. Arguments and
+    errors are those of :func:`roc_update`.
 
     Example:
         >>> roc_curve(torch.tensor([0.1, 0.9]), torch.tensor([False, True])).specificity
@@ -309,10 +309,8 @@ def roc_curve(score: Tensor, correct: Tensor, *, valid: Tensor | None = None) ->
 def roc_auc(score: Tensor, correct: Tensor, *, valid: Tensor | None = None) -> float:
     """Probability that a correct match scores higher than an incorrect one, ties counting one half.
 
-    Arguments and errors are those of :func:`roc_update`.
-
-    Returns:
-        The area under the ROC curve; NaN if there is no correct or no incorrect match. No gradient.
+    This is the area under the ROC curve; NaN if there is no correct or no incorrect match. No gradient. Arguments and
+    errors are those of :func:`roc_update`.
 
     Example:
         >>> roc_auc(torch.tensor([0.1, 0.5, 0.5]), torch.tensor([False, True, False]))
@@ -328,13 +326,8 @@ def specificity_at_sensitivity(
 
     The threshold is one of the scores, and everything up to it is rejected: equal scores go together, and even
     ``sensitivity=0`` rejects the lowest of them. ``sensitivity`` is the fraction of the incorrect matches to reject,
-    0..1; the other arguments are as in :func:`roc_update`.
-
-    Returns:
-        The specificity; NaN if there is no correct or no incorrect match. No gradient.
-
-    Raises:
-        ValueError: if ``sensitivity`` lies outside 0..1, or as :func:`roc_update`.
+    0..1, else ValueError; the other arguments and errors are those of :func:`roc_update`. NaN if there is no correct or
+    no incorrect match. No gradient.
 
     Example:
         >>> score, correct = torch.tensor([0.1, 0.2, 0.2, 0.7]), torch.tensor([False, False, True, True])
@@ -350,9 +343,9 @@ class IsolatedCounts:
 
     Attributes:
         num_correct: correct matches.
-        num_correct_isolated: those of them that no other match accompanies.
+        num_correct_isolated: correct matches that are alone between their two objects.
         num_incorrect: incorrect matches.
-        num_incorrect_isolated: those of them that no other match accompanies.
+        num_incorrect_isolated: incorrect matches that are alone between their two objects.
         num_unknown: matches left out because ground truth is unknown.
     """
 
@@ -376,7 +369,7 @@ def isolated_update(isolated: Tensor, correct: Tensor, valid: Tensor) -> Isolate
         valid: (M,) bool, ground truth is known.
 
     Returns:
-        The counts; all 0 for no match. Raises as :func:`confusion_update`.
+        The counts; all 0 for no match. Raises what :func:`confusion_update` raises.
 
     Example:
         >>> alone, right = torch.tensor([True, False, True]), torch.tensor([False, True, True])
@@ -401,5 +394,4 @@ def _ratio(numerator: int, denominator: int) -> float:
 def _check_masks(num_matches: int, **masks: Tensor) -> None:
     for name, mask in masks.items():
         check_vector(name, mask, num_matches)
-        if mask.dtype != torch.bool:
-            raise TypeError(f"{name} must be bool, got {mask.dtype}")
+        check_mask(name, mask)

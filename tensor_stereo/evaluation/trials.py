@@ -12,17 +12,17 @@ from torch import Tensor
 
 from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import CUTS, TrialConfig
-from tensor_stereo.evaluation.metrics import confusion_update, matches_against_gt, roc_update
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, matches_against_gt, roc_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
+from tensor_stereo.pipeline import STAGES as PIPELINE_STAGES
 from tensor_stereo.pipeline import Stopwatch, detect_pairs, score_pairs, to_gray_pairs
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
-STAGES = ("detect", "match", "perturb", "group", "graph", "relate", "score")
+STAGES = (*PIPELINE_STAGES[:2], "perturb", *PIPELINE_STAGES[2:])
 SCORE_BINS = 128  # equal bins of [0, 1] in which the rows count scores
-SENSITIVITY = 0.96  # where the paper reads the specificity
 _OUTDATED = {"graph": ("graph", "relate", "score"), "relate": (), "score": ()}  # what a new result makes useless
 _Result = TypeVar("_Result")
 
@@ -92,7 +92,7 @@ class Trial:
         )
         return {
             "auc": counts.auc(),
-            "specificity_at_sensitivity_96": counts.specificity_at(SENSITIVITY),
+            "specificity_at_sensitivity_96": counts.specificity_at(PAPER_SENSITIVITY),
             "score_counts_correct": correct,
             "score_counts_incorrect": incorrect,
         }

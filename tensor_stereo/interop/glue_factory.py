@@ -1,8 +1,8 @@
 """Dictionaries of glue-factory and LightGlue: padded keypoints and, per keypoint, the index of its partner.
 
 ``matches0[b, i] = j`` says that keypoint i of view 0 and keypoint j of view 1 are a match of pair b; -1 is none and -2
-is "ignore", as in its ground truth. glue-factory counts pixel corners, not centres, as integers: its keypoints are half
-a pixel larger than those of this library. The converters leave them so, because no verdict depends on a shift.
+is "ignore", which occurs in ground truth. glue-factory counts pixel corners, not centres, as integers: its keypoints
+are half a pixel larger than those of this library. The converters leave them so, because no verdict depends on a shift.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.configs import UNRECTIFIED, ConsensusConfig
 from tensor_stereo.modules import DelaunayFilter, FilterOutput
-from tensor_stereo.types import Matches, check_tensor, check_vector
+from tensor_stereo.types import Matches, check_mask, check_tensor, check_vector
 
 _ENTRIES = (
     *("keypoints0", "keypoints1"),
@@ -85,10 +85,10 @@ def to_glue_factory(
     """Write verdicts back into the form that the matches came from.
 
     Args:
-        data: as given to :func:`from_glue_factory`.
-        indices: (M, 3) int64 as returned by it.
-        inlier: (M,) bool.
-        score: (M,) of the verdicts, in [0, 1]; None leaves the scores of inliers as they are.
+        data: the dictionary that :func:`from_glue_factory` was given.
+        indices: (M, 3) int64, the second result of :func:`from_glue_factory`.
+        inlier: (M,) bool verdicts.
+        score: (M,) scores of the filter, in [0, 1]; None leaves the scores of inliers as they are.
 
     Returns:
         New tensors for those of ``matches0``, ``matches1``, ``matching_scores0`` and ``matching_scores1`` that ``data``
@@ -108,8 +108,7 @@ def to_glue_factory(
     if indices.ndim != 2 or indices.shape[1] != 3:
         raise ValueError(f"indices must have shape (M, 3), got {tuple(indices.shape)}")
     check_vector("inlier", inlier, len(indices))
-    if inlier.dtype != torch.bool:
-        raise TypeError(f"inlier must be bool, got {inlier.dtype}")
+    check_mask("inlier", inlier)
     if score is not None:
         check_vector("score", score, len(indices))
     weight = inlier.float() if score is None else torch.where(inlier, score, 0)
@@ -210,11 +209,11 @@ class GlueFactoryFilter(nn.Module):
         """Take out what the filter rejects.
 
         Args:
-            data: as for :func:`from_glue_factory`; ``matches1`` and ``matching_scores1`` are kept consistent.
+            data: a dictionary for :func:`from_glue_factory`; ``matches1`` and ``matching_scores1`` are kept consistent.
 
         Returns:
-            As :func:`to_glue_factory`, with the score of an inlier multiplied by the filter's. Gradients flow to the
-            matcher's scores, and to the keypoints if the filter's score is differentiable.
+            The result of :func:`to_glue_factory`, with the score of an inlier multiplied by the filter's. Gradients
+            flow to the matcher's scores, and to the keypoints if the filter's score is differentiable.
         """
         matches, indices = from_glue_factory(data)
         output = self.filter(matches, **_images_of(data, self.filter))

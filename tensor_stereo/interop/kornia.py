@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from tensor_stereo.batching import batch_to_ptr
 from tensor_stereo.interop.glue_factory import from_glue_factory, to_glue_factory, two_view_filter
 from tensor_stereo.modules import FilterOutput, Images
-from tensor_stereo.types import Matches, check_integer, check_tensor, check_vector
+from tensor_stereo.types import Matches, check_integer, check_mask, check_tensor, check_vector
 
 _ROWS = ("keypoints0", "keypoints1", "confidence", "batch_indexes")  # what LoFTR returns, one row per match
 
@@ -36,7 +36,7 @@ def from_lightglue(data: Mapping[str, Any], output: Mapping[str, Any]) -> tuple[
 
     Raises:
         ValueError: if an entry is missing or shapes disagree.
-        TypeError: as :func:`~tensor_stereo.interop.glue_factory.from_glue_factory`.
+        TypeError: if ``matches0`` is not int64 or keypoints are neither float32 nor float64.
 
     Example:
         >>> points = {"keypoints": torch.tensor([[[1.0, 2.0], [3.0, 4.0]]])}
@@ -60,10 +60,10 @@ def to_lightglue(
     """LightGlue's output without the rejected matches.
 
     Args:
-        output: as given to :func:`from_lightglue`.
-        indices: (M, 3) int64 as returned by it.
+        output: the output that :func:`from_lightglue` was given.
+        indices: (M, 3) int64, the second result of :func:`from_lightglue`.
         inlier: (M,) bool.
-        score: (M,) of the verdicts, in [0, 1]; None leaves the scores of inliers as they are.
+        score: (M,) scores of the filter, in [0, 1]; None leaves the scores of inliers as they are.
 
     Returns:
         A dictionary of the same keys. A rejected match is -1 with score 0 in ``matches0`` and ``matches1`` and missing
@@ -134,9 +134,10 @@ def to_loftr(output: Mapping[str, Any], inlier: Tensor, score: Tensor | None = N
     """The output of LoFTR or LocalFeatureMatcher without the rejected rows.
 
     Args:
-        output: as for :func:`from_loftr`; LocalFeatureMatcher's ``lafs0`` and ``lafs1`` (1, M, 2, 3) are cut too.
+        output: the output that :func:`from_loftr` was given; LocalFeatureMatcher's ``lafs0`` and ``lafs1``
+            (1, M, 2, 3) are cut too.
         inlier: (M,) bool.
-        score: (M,) of the verdicts, by which ``confidence`` is multiplied; None leaves it.
+        score: (M,) scores of the filter, by which ``confidence`` is multiplied; None leaves it.
 
     Returns:
         A dictionary of the same keys. Gradients flow.
@@ -153,8 +154,7 @@ def to_loftr(output: Mapping[str, Any], inlier: Tensor, score: Tensor | None = N
     """
     num_matches = len(output["keypoints0"])
     check_vector("inlier", inlier, num_matches)
-    if inlier.dtype != torch.bool:
-        raise TypeError(f"inlier must be bool, got {inlier.dtype}")
+    check_mask("inlier", inlier)
     result = dict(output)
     for name in (name for name in _ROWS if name in output):
         result[name] = output[name][inlier]
@@ -227,7 +227,7 @@ def filter_matches(
     Args:
         lafs1: (B, N1, 2, 3), or (N1, 2, 3) for one pair: local affine frames of the first view, px.
         lafs2: (B, N2, 2, 3) or (N2, 2, 3), of the second view.
-        indices: (K, 2) or (K, 3) int64, as for :func:`from_lafs`.
+        indices: (K, 2) or (K, 3) int64 rows; see :func:`from_lafs`.
         distances: (K, 1) or (K,) of the matcher, lower is better. They only decide which of several matches of one
             keypoint counts; without them it is the first.
         filter: Takes Matches, returns a FilterOutput; None is
@@ -243,7 +243,7 @@ def filter_matches(
         their order. Gradients flow to the LAFs if the score is differentiable.
 
     Raises:
-        ValueError, TypeError: as :func:`from_lafs`.
+        ValueError, TypeError: for what :func:`from_lafs` refuses.
 
     Example:
         >>> x, y = torch.meshgrid(torch.arange(0.0, 40, 10), torch.arange(0.0, 40, 10), indexing="xy")
@@ -329,8 +329,8 @@ class FilteredMatcher(nn.Module):
             lafs2: (1, N2, 2, 3) or None.
 
         Returns:
-            distances (K', 1), which are 1 - score of the filter, and indices (K', 2) int64. Gradients as in
-            :func:`filter_matches`.
+            distances (K', 1), which are 1 - score of the filter, and indices (K', 2) int64. Gradients flow to
+            the LAFs if the score is differentiable.
 
         Raises:
             ValueError: if only one view has LAFs.

@@ -18,9 +18,9 @@ from tensor_stereo.interop.verdicts import (
     FilterSummary,
     Int,
     MatchFilter,
-    check_keypoints,
     filter_matches,
 )
+from tensor_stereo.ops.segments import check_range
 from tensor_stereo.types import Matches, Relation
 
 _POINTS = ("x0", "y0", "x1", "y1")
@@ -41,7 +41,8 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     table of one pair.
 
     Raises:
-        ValueError: if the file is damaged or a column or value is wrong; the message names file, row (from 0), column.
+        ValueError: if the file is damaged or a column or value is wrong; the message names file, line of a
+            CSV file or row (from 1) of a Parquet file, and column.
         OSError: if the copy cannot be written.
     """
     table = _read_csv(source) if source.suffix.casefold() == ".csv" else _read_parquet(source)
@@ -110,7 +111,7 @@ def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
     if not (pair.dtype.is_integer() or pair.dtype in (pl.String, pl.Categorical, pl.Enum)):
         raise ValueError(f"{source}: column 'pair' must hold strings or integers, got {pair.dtype}")
     if pair.has_nulls():
-        raise ValueError(f"{source}, row {pair.is_null().arg_max()}: column 'pair' is empty")
+        raise ValueError(f"{_line(source, pair.is_null().arg_max() or 0)}: column 'pair' is empty")
     if not pair.dtype.is_integer():
         pair = pair.cast(pl.String)
     numbers: Int = pair.rank("dense").to_numpy().astype(np.int64) - 1
@@ -127,7 +128,7 @@ def _to_matches(
     x0, y0, x1, y1 = (_numbers(source, table, name, pl.Float64) for name in _POINTS)
     views = np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
     for names, points in zip(("x0, y0", "x1, y1"), views, strict=True):
-        check_keypoints(points, lambda row, names=names: f"{_place(source, table, row)}: ({names})")  # type: ignore[misc]
+        check_range(points, lambda row, names=names: f"{_place(source, table, row)}: ({names})")  # type: ignore[misc]
     cost = group = None
     if "cost" in table.columns:
         values = _numbers(source, table, "cost", pl.Float64)
@@ -160,4 +161,9 @@ def _numbers(source: Path, table: pl.DataFrame, name: str, dtype: type[pl.DataTy
 
 
 def _place(source: Path, table: pl.DataFrame, row: int) -> str:
-    return f"{source}, row {row}" + (f" (pair {table['pair'][row]!r})" if "pair" in table.columns else "")
+    return _line(source, row) + (f" (pair {table['pair'][row]!r})" if "pair" in table.columns else "")
+
+
+def _line(source: Path, row: int) -> str:
+    """Where a row of the table stands: the line that an editor shows, below the header, or a number from 1."""
+    return f"{source}, line {row + 2}" if source.suffix.casefold() == ".csv" else f"{source}, row {row + 1}"

@@ -19,10 +19,10 @@ from tensor_stereo.interop.verdicts import (
     FilterSummary,
     MatchFilter,
     Verdicts,
-    check_keypoints,
     filter_matches,
     pick_matches,
 )
+from tensor_stereo.ops.segments import check_range
 from tensor_stereo.types import Matches
 
 _HEADER_BYTES = 10_000  # what NumPy itself accepts of a header, by default
@@ -48,7 +48,7 @@ _INDEXED = {
 def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     """Copy an archive and add ``inlier`` bool, ``relation`` int8 and, if the settings name one, ``score`` float64.
 
-    Two forms are read. Rows, as in :class:`~tensor_stereo.Matches`: ``keypoints0`` and ``keypoints1`` (M, 2), and
+    Two forms are read. Rows, the form of :class:`~tensor_stereo.Matches`: ``keypoints0`` and ``keypoints1`` (M, 2), and
     optionally ``ptr`` (B + 1,), ``cost`` (M,) and ``group`` (M,); the results are (M,). One pair, as LightGlue and
     glue-factory have it: ``keypoints0`` (N0, 2), ``keypoints1`` (N1, 2), ``matches0`` (N0,) with -1 and -2, and
     optionally ``matching_scores0`` (N0,), higher is better; the results are (N0,), and False, 0 and UNTESTED where
@@ -201,8 +201,8 @@ def _ragged_matches(source: Path, arrays: Mapping[str, Array]) -> Matches:
     def describe(name: str, row: int) -> str:
         return f"{source}: {name}, row {row} (pair {np.searchsorted(ptr, row, side='right') - 1}),"
 
-    check_keypoints(matches.keypoints0.numpy(), lambda row: describe("keypoints0", row))
-    check_keypoints(matches.keypoints1.numpy(), lambda row: describe("keypoints1", row))
+    check_range(matches.keypoints0.numpy(), lambda row: describe("keypoints0", row))
+    check_range(matches.keypoints1.numpy(), lambda row: describe("keypoints1", row))
     if matches.cost is not None and bool(matches.cost.isnan().any()):
         raise ValueError(f"{describe('cost', int(matches.cost.isnan().int().argmax()))} must not be NaN")
     return matches

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tensor_stereo.types import Matches, check_vector
+from tensor_stereo.types import Matches, check_mask, check_vector
 
 
 def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], dmatches: Sequence[Any]) -> Matches:
@@ -19,7 +19,8 @@ def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], dmatches: 
     Args:
         keypoints0: list of ``cv2.KeyPoint`` of view 0, the query.
         keypoints1: list of ``cv2.KeyPoint`` of view 1, the train image.
-        dmatches: list of ``cv2.DMatch`` as from ``BFMatcher.match``; of ``knnMatch``, take one per keypoint first.
+        dmatches: list of ``cv2.DMatch``, the result of ``BFMatcher.match``; of the lists of ``knnMatch``, take one
+            match per keypoint first.
 
     Returns:
         Matches of one pair on the CPU, float32, row by row those of ``dmatches``; cost is ``distance``. Join several
@@ -27,7 +28,7 @@ def from_opencv(keypoints0: Sequence[Any], keypoints1: Sequence[Any], dmatches: 
 
     Raises:
         ValueError: if a DMatch names a keypoint that is not there.
-        TypeError: if ``dmatches`` holds something else, as the lists of ``knnMatch``.
+        TypeError: if ``dmatches`` holds something else, such as the lists of ``knnMatch``.
 
     Example:
         >>> import cv2
@@ -57,7 +58,7 @@ def select_dmatches(dmatches: Sequence[Any], inlier: Tensor) -> list[Any]:
     """The ``cv2.DMatch`` that are inliers, in their order, for the same lists of keypoints.
 
     Args:
-        dmatches: as given to :func:`from_opencv`.
+        dmatches: the list that :func:`from_opencv` was given.
         inlier: (M,) bool.
 
     Raises:
@@ -70,8 +71,7 @@ def select_dmatches(dmatches: Sequence[Any], inlier: Tensor) -> list[Any]:
         [7]
     """
     check_vector("inlier", inlier, len(dmatches))
-    if inlier.dtype != torch.bool:
-        raise TypeError(f"inlier must be bool, got {inlier.dtype}")
+    check_mask("inlier", inlier)
     return [match for match, keep in zip(dmatches, inlier.tolist(), strict=True) if keep]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tensor_stereo.batching import collate_matches, select_pairs
 from tensor_stereo.modules import FilterOutput
-from tensor_stereo.ops.segments import LARGEST, SMALLEST
+from tensor_stereo.ops.segments import check_range
 from tensor_stereo.types import Matches, Relation
 
 Array = NDArray[Any]
@@ -82,7 +82,7 @@ def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
 
     Args:
         matches: B pairs on the CPU.
-        run: takes Matches, returns a FilterOutput; pairs must not depend on each other.
+        run: a filter that takes Matches and returns a FilterOutput; pairs must not depend on each other.
 
     Example:
         >>> from tensor_stereo import DelaunayFilter
@@ -105,11 +105,11 @@ def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
 
 
 def filter_each(items: Iterable[tuple[Key, Matches]], run: MatchFilter) -> Iterator[tuple[Key, Verdicts]]:
-    """Run a filter over a stream of pairs, as many at once as :func:`filter_matches` takes in one block.
+    """Run a filter over a stream of pairs, in the blocks of :func:`filter_matches`.
 
     Args:
-        items: what names a pair, and its matches; some pairs may have a cost and others none.
-        run: as for :func:`filter_matches`.
+        items: a key for each pair, and its matches; some pairs may have a cost and others none.
+        run: a filter for :func:`filter_matches`.
 
     Yields:
         Every key with its verdicts, in order.
@@ -135,22 +135,6 @@ def _filter_block(block: list[tuple[Key, Matches]], run: MatchFilter) -> Iterato
         yield key, Verdicts(*values)
 
 
-def check_keypoints(points: Float, describe: Callable[[int], str]) -> None:
-    """Raise unless all of (M, 2) ``points`` can be triangulated; ``describe`` names the keypoint of a row.
-
-    >>> check_keypoints(np.array([[0.0, np.inf]]), lambda row: f"m.csv, row {row}: keypoint 0")
-    Traceback (most recent call last):
-    ...
-    ValueError: m.csv, row 0: keypoint 0 must be finite, 0 or 1e-60..1e+60 in magnitude, got (0.0, inf)
-    """
-    magnitude = np.abs(points)
-    good = ((magnitude == 0) | ((magnitude >= SMALLEST) & (magnitude <= LARGEST))).all(axis=1)
-    if not good.all():
-        row = int(good.argmin())
-        limits = f"0 or {SMALLEST:g}..{LARGEST:g} in magnitude"
-        raise ValueError(f"{describe(row)} must be finite, {limits}, got {tuple(points[row].tolist())}")
-
-
 def pick_matches(place: str, keypoints0: Array, keypoints1: Array, matches0: Array, scores0: Array | None) -> Matches:
     """One pair's matches from the partner of each keypoint, in the order of view 0.
 
@@ -159,7 +143,7 @@ def pick_matches(place: str, keypoints0: Array, keypoints1: Array, matches0: Arr
         keypoints0: (N0, 2), (x, y) in px.
         keypoints1: (N1, 2).
         matches0: at most (N0,) integers: a row of ``keypoints1``, -1 for none, -2 for "ignore".
-        scores0: as ``matches0``, higher is better; the cost is 1 - score.
+        scores0: one score per row of ``matches0``, higher is better; the cost is 1 - score.
 
     Raises:
         ValueError: if a partner does not exist, a matched keypoint is not finite or a score is NaN.
@@ -194,10 +178,10 @@ def pair_matches(
     rows1: Int,
     cost: Float | None = None,
 ) -> Matches:
-    """One pair's matches from existing rows of both views; raises as :func:`pick_matches`."""
+    """One pair's matches from existing rows of both views; raises ValueError if a keypoint is not finite."""
     views = keypoints0[rows0].astype(np.float64), keypoints1[rows1].astype(np.float64)
     for name, points, rows in zip(("keypoints0", "keypoints1"), views, (rows0, rows1), strict=True):
-        check_keypoints(points, lambda k, name=name, rows=rows: f"{place}: {name}, row {rows[k]},")  # type: ignore[misc]
+        check_range(points, lambda k, name=name, rows=rows: f"{place}: {name}, row {rows[k]},")  # type: ignore[misc]
     ptr = torch.tensor([0, len(rows0)])
     left, right = (torch.from_numpy(points) for points in views)
     return Matches(left, right, ptr, None if cost is None else torch.from_numpy(cost))

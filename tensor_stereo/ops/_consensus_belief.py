@@ -67,34 +67,32 @@ def consensus_belief(
 ) -> Tensor:
     """How likely every match is right, by what its believed neighbours in both views predict.
 
-    The sums of the kernel and of plain torch run in the same order; only transcendental functions may differ, in the
-    last bits.
+    The sums of both back ends run in the same order.
 
     Args:
         keypoints0: (M, 2) float32 or float64 px of view 0.
-        keypoints1: (M, 2) of view 1.
+        keypoints1: (M, 2) float32 or float64 px of view 1.
         ptr: (B + 1,) int64 offsets of the pairs.
-        cost: (M,) floating point, or None. Those of a pair with negative ones count from the least, those of a pair
-            with any beyond 1e300 say nothing.
+        cost: (M,) floating point, or None. In a pair with negative costs, costs count from the lowest one. In a pair
+            with a cost beyond 1e300, costs are no evidence.
         crow0: (M + 1,) int64 row offsets of the graph of view 0.
         cols0: (nnz0,) int64 neighbours, of the same pair and distinct from the match in view 0.
-        crow1: (M + 1,), of view 1.
-        cols1: (nnz1,).
-        tolerance_px: this and all that follow are the settings of
-            :class:`tensor_stereo.configs.ConsensusConfig`.
-        whole_tolerance_px: for keypoints on whole pixels.
-        row_tolerance_px: None: row offsets are no evidence.
-        whole_row_tolerance_px: for keypoints on whole pixels.
-        slope: px/px.
-        reach: in edge lengths.
-        doubt: in votes.
-        cost_weight: in log-odds.
-        num_rounds: 0 gives the beliefs without neighbours.
-        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+        crow1: (M + 1,) int64 row offsets of the graph of view 1.
+        cols1: (nnz1,) int64 neighbours in view 1.
+        tolerance_px: setting of :class:`tensor_stereo.configs.ConsensusConfig`, like all that follow.
+        whole_tolerance_px: tolerance for keypoints on whole pixels.
+        row_tolerance_px: tolerance of row offsets, or None: row offsets are no evidence.
+        whole_row_tolerance_px: tolerance of row offsets for keypoints on whole pixels.
+        slope: expected slope of the displacement in px/px.
+        reach: distance in edge lengths at which the vote of a neighbour counts half.
+        doubt: votes against every match.
+        cost_weight: log-odds per standard deviation of the cost.
+        num_rounds: number of rounds; 0 gives the beliefs without neighbours.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
-        (M,) float64 in [0, 1). Gradients flow to both point sets and the cost: by plain torch, which the backward pass
-        runs anew, so that they may be differentiated again.
+        (M,) float64 in [0, 1). Gradients flow to both point sets and the cost. The backward pass runs plain torch again
+        under either back end, so that gradients can be differentiated again.
 
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])

@@ -50,8 +50,8 @@ def delaunay_graph(
         keypoints: (N, 2) float32 or float64.
         ptr: (B + 1,) int64.
         group: (N,) integer or None.
-        tie_tolerance: in [0, 1), in edge lengths.
-        backend: ``auto``, ``native`` or ``scipy``.
+        tie_tolerance: tolerance of the graph in [0, 1), in edge lengths.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         crow (N + 1,) and cols (nnz,) int64. No gradient.
@@ -90,8 +90,8 @@ def match_graphs(
         ptr: (B + 1,) int64.
         cost: (M,) or None.
         group: (M,) integer or None.
-        tie_tolerance: in [0, 1), in edge lengths.
-        backend: ``auto``, ``native`` or ``scipy``.
+        tie_tolerance: tolerance of the graph in [0, 1), in edge lengths.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         crow0, cols0, crow1, cols1 and group_size (M,), int64. No gradient.

@@ -17,20 +17,20 @@ from tensor_stereo.types import check_pairs
 
 
 def _fake(*arguments: Any) -> Tensor:
-    _, _, _, pairs, _ = arguments
-    return torch.empty_like(pairs)
+    _, _, _, links, _ = arguments
+    return torch.empty_like(links)
 
 
 @operator(_fake)
-def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, pairs: Tensor, backend: str) -> Tensor:
-    """Critical points of given pairs of points; see :func:`tensor_stereo.soft.dual_critical_points`.
+def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, links: Tensor, backend: str) -> Tensor:
+    """Critical points of given links; see :func:`tensor_stereo.soft.dual_critical_points`.
 
     Args:
         keypoints: (N, 2) float32 or float64.
         ptr: (B + 1,) int64.
         group: (N,) integer or None.
-        pairs: (E, 2) int64 rows.
-        backend: ``auto``, ``native`` or ``scipy``.
+        links: (E, 2) int64 rows of two distinct points of one segment.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         (E, 2) int64 rows. No gradient.
@@ -42,26 +42,26 @@ def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, p
     """
     kernels = native(backend)
     points = to_points("keypoints", keypoints, ptr, kernels)
-    check_pairs("pairs", pairs, len(points))
-    rows = pairs.numpy(force=True)
+    check_pairs("links", links, len(points))
+    rows = links.numpy(force=True)
     segment = pair_of(ptr) if group is None else segments_of(ptr, group, len(points))
     kept = first_of_coincident(coincident_ids(points, segment))
     bad = (rows[:, 0] == rows[:, 1]) | (segment[rows[:, 0]] != segment[rows[:, 1]]) | ~kept[rows].all(1)
     if bad.any():
         given = rows[bad.argmax()].tolist()
-        raise ValueError(f"pairs must join two distinct points of one segment, not repeated before, got {given}")
+        raise ValueError(f"links must join two distinct points of one segment, not repeated before, got {given}")
     vertex, segment_ptr = vertices_of(ptr, segment, kept)
     number = segment[rows[:, 0]]
     order = np.argsort(number, kind="stable")
     counts = np.bincount(number, minlength=len(segment_ptr) - 1)
-    pair_ptr = np.concatenate([[0], np.cumsum(counts)])
+    link_ptr = np.concatenate([[0], np.cumsum(counts)])
     if kernels is not None:
         threads = torch.get_num_threads()
-        found = kernels.dual_critical_points(points, vertex, segment_ptr, rows[order], pair_ptr, threads)
+        found = kernels.dual_critical_points(points, vertex, segment_ptr, rows[order], link_ptr, threads)
     else:
         place = np.zeros(len(points), dtype=np.int64)
         place[vertex] = np.arange(len(vertex))
-        found = critical_points(points[vertex] + 0.0, segment_ptr, place[rows[order]], pair_ptr)
+        found = critical_points(points[vertex] + 0.0, segment_ptr, place[rows[order]], link_ptr)
         found = np.where(found < 0, found, vertex[np.maximum(found, 0)])
     result = np.empty_like(found)
     result[order] = found

@@ -42,15 +42,15 @@ def gated_ssd(
 
     Args:
         keypoints0: (N0, 2) px of view 0, finite.
-        keypoints1: (N1, 2) px of view 1.
+        keypoints1: (N1, 2) px of view 1, finite.
         descriptors0: (N0, D) float32.
         descriptors1: (N1, D) float32.
-        ptr0: (B + 1,) int64 offsets of the images.
-        ptr1: (B + 1,).
-        max_row_offset_px: infinity opens the gate.
-        min_disparity_px: minus infinity opens it.
-        max_disparity_px: infinity opens it.
-        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+        ptr0: (B + 1,) int64 offsets of the images of view 0.
+        ptr1: (B + 1,) int64 offsets of the images of view 1.
+        max_row_offset_px: largest row offset; infinity opens the gate.
+        min_disparity_px: smallest disparity; minus infinity opens the gate.
+        max_disparity_px: largest disparity; infinity opens the gate.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         cost (N0,) float32, index (N0,) int64 rows of view 1, cost of the second-best candidate (N0,) float32, and seen

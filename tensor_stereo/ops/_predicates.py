@@ -23,7 +23,7 @@ def orientation(a: Tensor, b: Tensor, c: Tensor, backend: str) -> Tensor:
         a: (K, 2) float64, 0 or 1e-60..1e60 in magnitude.
         b: (K, 2).
         c: (K, 2).
-        backend: ``auto``, ``native`` or ``scipy`` (which here is NumPy with Python's integers).
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         (K,) int8: 1 counter-clockwise with y upwards, -1 clockwise, 0 collinear. No gradient.
@@ -45,7 +45,7 @@ def incircle(a: Tensor, b: Tensor, c: Tensor, d: Tensor, backend: str) -> Tensor
         b: (K, 2).
         c: (K, 2).
         d: (K, 2).
-        backend: as in :func:`orientation`.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         (K,) int8: 1 if d lies strictly inside, -1 strictly outside, 0 on the circle. No gradient.

@@ -33,7 +33,7 @@ def relate(
         group_size: (M,) int64 distinct matches in the same group, 0 for duplicates.
         min_group_size: groups below it are UNTESTED, as is an empty neighbour set in a group with other matches.
         accept_subsets: whether SUBSET and SUPERSET are inliers besides EQUAL.
-        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         relation (M,) int8 of :class:`tensor_stereo.Relation`, and inlier (M,) bool. No gradient.

@@ -24,9 +24,9 @@ def row_overlap(
     Args:
         crow0: (M + 1,) int64 row offsets.
         cols0: (nnz0,) int64 columns, ascending within a row.
-        crow1: (M + 1,).
-        cols1: (nnz1,).
-        backend: ``auto``, ``native`` or ``scipy`` (which here is plain torch).
+        crow1: (M + 1,) int64 row offsets of the second pattern.
+        cols1: (nnz1,) int64 columns of the second pattern, ascending within a row.
+        backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         overlap, degree0 and degree1, (M,) int64. No gradient.

@@ -1,4 +1,15 @@
-"""Which back end runs: the compiled kernels, or scipy and plain torch."""
+"""The back ends, and which of them runs.
+
+Every operator takes the name of a back end:
+
+- ``native``: the compiled kernels.
+- ``scipy``: no compiled code of this library. Graphs come from scipy and exact integer arithmetic, everything else from
+  plain torch. Slower, and the definition of what the kernels compute.
+- ``auto``: ``native`` where it is installed, otherwise ``scipy``; the environment variable ``TENSOR_STEREO_BACKEND``
+  overrides it.
+
+Both give the same bits, except for the last digits of what goes through transcendental functions or is a gradient.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +40,8 @@ class BackendInfo(NamedTuple):
 def backend() -> BackendInfo:
     """The back end that ``auto`` stands for in this process, and what is missing if it is not ``native``.
 
-    The environment variable ``TENSOR_STEREO_BACKEND`` (``auto``, ``native`` or ``scipy``) overrides it.
-
     Raises:
-        ValueError: if that variable names an unknown back end, or ``native`` where it is not installed.
+        ValueError: if ``TENSOR_STEREO_BACKEND`` names an unknown back end, or ``native`` where it is not installed.
 
     Example:
         >>> backend().name in ("native", "scipy")
@@ -44,12 +53,12 @@ def backend() -> BackendInfo:
 
 
 def native(backend: str) -> ModuleType | None:
-    """The compiled module where ``backend`` stands for it; None where scipy and plain torch shall run.
+    """The compiled module where ``backend`` stands for it, otherwise None.
 
     Every operator asks this and nothing else, so that no kernel runs under ``scipy``.
 
     Raises:
-        ValueError: as :func:`resolve_backend`.
+        ValueError: for what :func:`resolve_backend` refuses.
     """
     return kernels if resolve_backend(backend) == "native" else None
 

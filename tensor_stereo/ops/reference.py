@@ -16,12 +16,12 @@ NONE = torch.iinfo(torch.int64).max  # key of "no candidate", larger than that o
 _INDEX_BITS = 32
 _LANES = 16
 _CHUNK_VALUES = 2**17  # descriptor values that are compared at a time: 512 kB, which stay in the cache
-_CHUNK_CANDIDATES = 2**18  # candidate pairs that are listed at a time
+_CHUNK_CANDIDATES = 2**18  # candidates that are listed at a time
 _MAX_COORDINATE_PX = 2**24
 
 
 def row_overlap(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Row sums of A0 AND A1, and of A0 and A1; see :func:`tensor_stereo.ops._row_overlap`.
+    """Row sums of A0 AND A1, and of A0 and A1; see :func:`tensor_stereo.ops.row_overlap`.
 
     torch has no arithmetic on sparse boolean tensors; the AND is a merge of the sorted keys row * M + column.
 
@@ -45,7 +45,7 @@ def row_overlap(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor) -> t
 def relate(
     overlap: Tensor, degree0: Tensor, degree1: Tensor, group_size: Tensor, min_group_size: int, accept_subsets: bool
 ) -> tuple[Tensor, Tensor]:
-    """Relation and verdict from the sizes of neighbour sets; see :func:`tensor_stereo.ops._relate`."""
+    """Relation and verdict from the sizes of neighbour sets; see :func:`tensor_stereo.ops.relate`."""
     within0, within1 = overlap == degree0, overlap == degree1
     relation = torch.full_like(overlap, Relation.CONFLICT, dtype=torch.int8)
     relation[within0] = int(Relation.SUBSET)
@@ -59,7 +59,7 @@ def relate(
 
 
 def gated_ssd(features0: Features, features1: Features, config: MatchingConfig) -> tuple[Tensor, ...]:
-    """Nearest neighbours inside the gates; see :func:`tensor_stereo.ops._gated_ssd` for the five results.
+    """Nearest neighbours inside the gates; see :func:`tensor_stereo.ops.gated_ssd` for the five results.
 
     Example:
         >>> ptr = torch.tensor([0, 2])
@@ -141,7 +141,7 @@ def ssd(descriptors0: Tensor, descriptors1: Tensor, index0: Tensor, index1: Tens
 def gated_candidates(
     features0: Features, features1: Features, config: MatchingConfig
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """List the pairs of keypoints inside the gates, in blocks of bounded size.
+    """List the candidates, two keypoints inside the gates, in blocks of bounded size.
 
     Cells are one pixel wide and max(1, ``max_row_offset_px``) high. Sorted by (pair, cell row, cell column), the
     cells of one row that a gate touches are one run, found by binary search; a gate touches at most four rows.
@@ -229,51 +229,3 @@ def _blocks(counts: Tensor) -> Iterator[tuple[int, int]]:
     for size in sizes.tolist():
         start, stop = stop, stop + size
         yield start, stop
-
-
-def dual_edge_ratio(points: Tensor, pairs: Tensor, critical: Tensor, bound: float) -> Tensor:
-    """Signed lengths of dual Voronoi edges, with autograd; see :func:`tensor_stereo.ops._dual_edge_ratio`."""
-    ends = []
-    for k in critical.unbind(1):
-        along, across, is_free = _dual_end(points, pairs, k, bound)
-        with torch.no_grad():
-            end = (along / across).nan_to_num(bound, posinf=bound, neginf=-bound).clamp(-bound, bound)
-            clipped = torch.where(k == -1, bound, end)
-        # masked before the division, because where() would turn an unused 0 / 0 into a NaN gradient
-        ends.append(torch.where(is_free, along / torch.where(is_free, across, 1), clipped))
-    return torch.where((critical == -2).any(1), -2 * bound, ends[0] + ends[1])
-
-
-def dual_edge_ratio_backward(points: Tensor, pairs: Tensor, critical: Tensor, gradient: Tensor, bound: float) -> Tensor:
-    """Gradient of :func:`dual_edge_ratio` with respect to the points, written out.
-
-    With q = p_k - p_i, d = p_j - p_i and J the rotation by 90 degrees, an end is q.(q - d) / 2 |d x q|.
-    """
-    result = torch.zeros_like(points)
-    i, j = pairs.unbind(1)
-    d = points[j] - points[i]
-    gradient = gradient.masked_fill((critical == -2).any(1), 0)
-    for side, k in zip((-1, 1), critical.unbind(1), strict=True):
-        along, across, is_free = _dual_end(points, pairs, k, bound)
-        q = points[k.clamp(min=0)] - points[i]
-        across = torch.where(is_free, across, 1)[:, None]
-        scale = torch.where(is_free, gradient, 0)[:, None] / across
-        turn = 2 * side * along[:, None] / across
-        of_k = scale * (2 * q - d - turn * _rotate(d))
-        of_j = scale * (turn * _rotate(q) - q)
-        for index, part in ((k.clamp(min=0), of_k), (j, of_j), (i, -of_k - of_j)):
-            result.index_add_(0, index, part)
-    return result
-
-
-def _dual_end(points: Tensor, pairs: Tensor, k: Tensor, bound: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Numerator and denominator of the ends towards k, and which are finite and not clipped."""
-    i = points[pairs[:, 0]]
-    dx, dy = (points[pairs[:, 1]] - i).unbind(1)
-    x, y = (points[k.clamp(min=0)] - i).unbind(1)
-    along, across = x * (x - dx) + y * (y - dy), 2 * (dx * y - dy * x).abs()
-    return along, across, (k >= 0) & ((along / across).detach().abs() < bound)
-
-
-def _rotate(vectors: Tensor) -> Tensor:
-    return torch.stack([-vectors[:, 1], vectors[:, 0]], 1)

@@ -57,7 +57,7 @@ def consensus_belief(
     cost_weight: float,
     num_rounds: int,
 ) -> Tensor:
-    """Beliefs in matches after some rounds, with autograd; see :func:`tensor_stereo.ops._consensus_belief`.
+    """Beliefs in matches after some rounds, with autograd; see :func:`tensor_stereo.ops.consensus_belief`.
 
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])
@@ -104,7 +104,7 @@ def _whole_pixels(views: tuple[Tensor, Tensor], pair: Tensor, count: Tensor) -> 
 def _standardized_cost(cost: Tensor, pair: Tensor, count: Tensor) -> Tensor:
     """(M,) logarithm of the cost, in standard deviations from the mean of its pair.
 
-    Costs of a pair that has negative ones count from the least; those of a pair that has infinite ones say nothing.
+    In a pair with negative costs, costs count from the lowest one; in a pair with infinite costs, they are no evidence.
     """
     usable = (_mean((cost.abs() <= _MAX_COST).to(cost), pair, count) == 1).index_select(0, pair)
     cost = torch.where(usable, cost, 0)

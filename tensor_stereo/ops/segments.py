@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import ModuleType
 
 import numpy as np
@@ -16,7 +17,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-SMALLEST, LARGEST = 1e-60, 1e60  # magnitudes whose degree-4 determinants neither underflow nor overflow
+_SMALLEST, _LARGEST = 1e-60, 1e60  # magnitudes whose degree-4 determinants neither underflow nor overflow
 
 
 def segments_of(ptr: Tensor, group: Tensor, num_rows: int) -> Int:
@@ -39,25 +40,36 @@ def pair_of(ptr: Tensor) -> Int:
 
 
 def to_points(name: str, keypoints: Tensor, ptr: Tensor, kernels: ModuleType | None = None) -> Float:
-    """Keypoints as a float64 array; raises for what the exact predicates cannot take, naming pair and row."""
+    """Keypoints as a float64 array; raises for what :func:`check_range` refuses, naming pair and row."""
     check_points(name, keypoints)
     check_ptr("ptr", ptr, len(keypoints))
     points: Float = keypoints.detach().to("cpu", torch.float64).contiguous().numpy()
-    row = _first_out_of_range(points, kernels)
-    if row >= 0:
+
+    def describe(row: int) -> str:
         pair = int(torch.searchsorted(ptr.cpu(), row, right=True)) - 1
-        where = f"row {row - int(ptr[pair])} of pair {pair}"
-        given = tuple(points[row].tolist())
-        raise ValueError(f"{name} must be finite, 0 or {SMALLEST:g}..{LARGEST:g} in magnitude, got {given} in {where}")
+        return f"{name} in row {row - int(ptr[pair])} of pair {pair}"
+
+    check_range(points, describe, kernels)
     return points
 
 
-def _first_out_of_range(points: Float, kernels: ModuleType | None) -> int:
+def check_range(points: Float, describe: Callable[[int], str], kernels: ModuleType | None = None) -> None:
+    """Raise unless the exact predicates can take all of (N, 2) ``points``; ``describe`` names the point of a row.
+
+    >>> check_range(np.array([[0.0, np.inf]]), lambda row: f"m.csv, row {row}: keypoint 0")
+    Traceback (most recent call last):
+    ...
+    ValueError: m.csv, row 0: keypoint 0 must be finite, 0 or 1e-60..1e+60 in magnitude, got (0.0, inf)
+    """
     if kernels is not None:
-        return int(kernels.first_point_out_of_range(points))
-    magnitude = np.abs(points)
-    bad = ~((magnitude == 0) | ((magnitude >= SMALLEST) & (magnitude <= LARGEST))).all(1)
-    return int(bad.argmax()) if bad.any() else -1
+        row = int(kernels.first_point_out_of_range(points))
+    else:
+        magnitude = np.abs(points)
+        good = ((magnitude == 0) | ((magnitude >= _SMALLEST) & (magnitude <= _LARGEST))).all(1)
+        row = -1 if good.all() else int(good.argmin())
+    if row >= 0:
+        limits = f"0 or {_SMALLEST:g}..{_LARGEST:g} in magnitude"
+        raise ValueError(f"{describe(row)} must be finite, {limits}, got {tuple(points[row].tolist())}")
 
 
 def one_to_one(views: list[Float], ptr: Tensor, cost: Tensor | None, kernels: ModuleType | None) -> Bool:

@@ -8,7 +8,6 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.reports.tables import Table, paper_tables, to_markdown
-
-PACKAGES = ("tensor-stereo", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "mahotas")
+from tensor_stereo.versions import package_versions
 
 
 def write_evaluation(
@@ -45,7 +43,7 @@ def write_evaluation(
     Raises:
         ValueError: if ``out`` holds the results of other settings.
     """
-    settings = {"config": asdict(config), "source": source, "versions": {name: version(name) for name in PACKAGES}}
+    settings = {"config": asdict(config), "source": source, "versions": package_versions()}
     if out is not None:
         _claim_folder(out, settings)
     rows: list[dict[str, Any]] = []

@@ -1,4 +1,7 @@
-"""What the learned score sees of every match and of every pair of neighbours, over both graphs of a batch."""
+"""What the learned score sees of every match and of every link, over both graphs of a batch.
+
+A link joins two matches that are neighbours in at least one view.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,13 @@ _TINY_PX2 = 1e-6  # added to squared lengths, so that their roots have a gradien
 
 
 class Receivers(NamedTuple):
-    """The U pairs of neighbours in the order of their ends."""
+    """The U links in the order of their ends."""
 
     i: Tensor  # (U,) int64 rows of one end
     j: Tensor  # (U,) int64 rows of the other
-    order_i: Tensor  # (U,) int64 pairs, by i
+    order_i: Tensor  # (U,) int64 links, sorted by i
     offsets_i: Tensor  # (M + 1,) int64 into ``order_i``
-    order_j: Tensor  # (U,) int64 pairs, by j
+    order_j: Tensor  # (U,) int64 links, sorted by j
     offsets_j: Tensor  # (M + 1,) int64 into ``order_j``
 
     def sum(self, to_i: Tensor, to_j: Tensor) -> Tensor:
@@ -41,7 +44,7 @@ class Receivers(NamedTuple):
 
 
 class Quantities(NamedTuple):
-    """What the network sees of M matches of B pairs, and of the U pairs of neighbours in either view; all float32."""
+    """What the network sees of M matches of B pairs, and of the U links between them; all float32."""
 
     nodes: Tensor  # (M, NUM_NODE) from the graphs and from the offset between rows
     cost: Tensor  # (M, NUM_COST); zero without cost
@@ -73,8 +76,8 @@ def measure_quantities(
 
     Args:
         matches: B pairs; without ``cost`` its columns are zero.
-        graphs: of the same matches.
-        evidence: of the images; None: its columns are zero.
+        graphs: graphs of the same matches.
+        evidence: evidence of the images; None: its columns are zero.
         config: ``backend`` is read; None means the defaults.
 
     Returns:
@@ -134,7 +137,7 @@ def check_fit(matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | N
 
 
 def find_receivers(i: Tensor, j: Tensor, num_matches: int) -> Receivers:
-    """Sort the pairs (i, j) by either end.
+    """Sort the links (i, j) by either end.
 
     >>> find_receivers(torch.tensor([0, 0]), torch.tensor([2, 1]), 3).offsets_j
     tensor([0, 0, 1, 2])

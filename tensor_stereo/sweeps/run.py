@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import logging
 import math
@@ -33,9 +32,9 @@ from tensor_stereo.sweeps.ray_engine import RayEngine
 from tensor_stereo.sweeps.store import FORMAT, RunStore, append_environment
 from tensor_stereo.sweeps.units import failed_unit
 from tensor_stereo.types import StereoPair
+from tensor_stereo.versions import package_versions
 
 EngineName = Literal["local", "ray"]
-PACKAGES = ("tensor-stereo", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "mahotas", "polars")
 MAX_DEATHS = 2  # workers that certainly died at a unit before it counts as failed
 BATCH_SECONDS = 1.0  # about: long against the way to a worker and back, short against a user's patience
 MAX_BATCH = 32
@@ -328,13 +327,5 @@ def _environment(engine: str, num_workers: int | None, shard: tuple[int, int]) -
         "engine": engine,
         "num_workers": num_workers,
         "shard": list(shard),
-        "versions": {name: _version(name) for name in PACKAGES},
+        "versions": package_versions(),
     }
-
-
-def _version(package: str) -> str | None:
-    """None where another package stands in for it."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

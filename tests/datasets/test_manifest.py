@@ -63,11 +63,11 @@ def test_a_list_names_pairs_relative_to_its_folder(tmp_path: Path) -> None:
     ("text", "error", "message"),
     [
         ("image0\na.ppm\n", ValueError, "no column 'image1'"),
-        ("image0,image1\na.ppm,\n", ValueError, "row 0: column 'image1' is empty"),
-        ("image0,image1\na.ppm,b.ppm\na.ppm,z.ppm\n", FileNotFoundError, "row 1: column 'image1'"),
+        ("image0,image1\na.ppm,\n", ValueError, "line 2: column 'image1' is empty"),
+        ("image0,image1\na.ppm,b.ppm\na.ppm,z.ppm\n", FileNotFoundError, "line 3: column 'image1'"),
         ("image0,image1,left\na.ppm,b.ppm,1\n", ValueError, "unknown column 'left'"),
-        ("image0,image1,gt_scale\na.ppm,b.ppm,-1\n", ValueError, "row 0: column 'gt_scale'"),
-        ("image0,image1,gt_scale\na.ppm,b.ppm,x\n", ValueError, "row 0: column 'gt_scale'"),
+        ("image0,image1,gt_scale\na.ppm,b.ppm,-1\n", ValueError, "line 2: column 'gt_scale'"),
+        ("image0,image1,gt_scale\na.ppm,b.ppm,x\n", ValueError, "line 2: column 'gt_scale'"),
         ("image0,image1,disparity_gt\na.ppm,b.ppm,d.pgm\n", ValueError, "column 'gt_scale' is empty"),
         ("image0,image1\na.ppm,b.ppm\na.ppm,c.ppm\n", ValueError, "two pairs are named mine/a"),
     ],
@@ -84,10 +84,10 @@ def test_a_wrong_list_names_file_row_and_column(
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("image0", "/no/such/file.png", "row 1: column 'image0' names /no/such/file.png"),
-        ("scene", None, "row 1: column 'scene' is empty"),
-        ("gt_scale", -3.0, "row 1: column 'gt_scale' must be positive"),
-        ("width_px", 0, "row 1: column 'width_px' must be positive"),
+        ("image0", "/no/such/file.png", "row 2: column 'image0' names /no/such/file.png"),
+        ("scene", None, "row 2: column 'scene' is empty"),
+        ("gt_scale", -3.0, "row 2: column 'gt_scale' must be positive"),
+        ("width_px", 0, "row 2: column 'width_px' must be positive"),
         ("dataset", "middlebury-2005", None),
     ],
 )
@@ -137,5 +137,5 @@ def test_a_name_says_nothing_of_the_encoding(tmp_path: Path) -> None:
     assert pair.disparity_gt is not None
     assert (pair.disparity_gt == 2).all()
     (tmp_path / "wrong.csv").write_text("image0,image1,gt_encoding\na.png,b.png,colour\n")
-    with pytest.raises(ValueError, match=r"wrong\.csv, row 0: column 'gt_encoding'.*'colour'"):
+    with pytest.raises(ValueError, match=r"wrong\.csv, line 2: column 'gt_encoding'.*'colour'"):
         build_manifest([tmp_path / "wrong.csv"])

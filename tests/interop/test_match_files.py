@@ -13,7 +13,7 @@ import pytest
 from tensor_stereo import UNRECTIFIED, DelaunayFilter, Matches
 from tensor_stereo.batching import ptr_to_batch, split_matches
 from tensor_stereo.configs import FileFilterConfig, FilterConfig, PipelineConfig
-from tensor_stereo.interop import match_files
+from tensor_stereo.interop.formats import FORMATS
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.match_batches import batch, expected, expected_of_any_views
@@ -216,8 +216,11 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
     (tmp_path / "folder.csv").mkdir()
     with pytest.raises(FileNotFoundError, match="source: there is no file"):
         filter_file(tmp_path / "folder.csv", out)
-    with pytest.raises(FileNotFoundError, match="out: there is no folder"):
-        filter_file(source, tmp_path / "none" / "out.csv")
+    made = tmp_path / "none" / "deeper" / "out.csv"
+    filter_file(str(source), str(made))
+    assert made.is_file()
+    with pytest.raises(OSError, match=r"out: the folder .* cannot be made"):
+        filter_file(source, source / "out.csv")
 
 
 @pytest.mark.parametrize("ending", [".npz", ".parquet", ".h5", ".db"])
@@ -236,7 +239,7 @@ def test_endings_may_be_in_capitals(tmp_path: Path) -> None:
 
 
 def test_every_format_has_its_first_bytes(tmp_path: Path) -> None:
-    assert set(match_files._FORMATS) == set(ENDINGS)
+    assert set(FORMATS) == set(ENDINGS)
     for ending in ENDINGS[:3]:
         source = write_source(tmp_path, ending, batch(7))["source"]
-        assert source.read_bytes().startswith(match_files._FORMATS[ending][0])
+        assert source.read_bytes().startswith(FORMATS[ending][0])

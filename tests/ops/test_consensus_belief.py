@@ -234,6 +234,7 @@ def test_gradients_reach_only_what_asks_for_them_and_keep_its_dtype(backend: str
     assert not consensus_belief(keypoints0, keypoints1, ptr, cost, *graphs, *DEFAULTS, backend).requires_grad
 
 
+@pytest.mark.slow  # compiles for ten seconds
 @pytest.mark.parametrize("backend", installed_backends())
 @pytest.mark.parametrize("has_cost", [False, True])
 def test_operator_keeps_the_rules_of_torch_and_compiles(backend: str, has_cost: bool) -> None:

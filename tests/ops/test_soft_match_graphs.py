@@ -1,4 +1,4 @@
-"""Both back ends find the same pairs and critical points; the definition over fractions says which are right."""
+"""Both back ends find the same links and critical points; the definition over fractions says which are right."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def _compare_back_ends(kind: str, seed: int, n: int, reach: tuple[float, float])
 @given(st.sampled_from(KINDS), st.integers(0, 10**6), st.integers(3, 14))
 def test_critical_points_have_an_empty_circle_on_their_side(backend: str, kind: str, seed: int, n: int) -> None:
     points = distinct_points(kind, seed, n)
-    pairs = np.stack(np.triu_indices(len(points), 1), 1)
+    links = np.stack(np.triu_indices(len(points), 1), 1)
     ptr = torch.tensor([0, len(points)])
-    found = ops.dual_critical_points(torch.from_numpy(points), ptr, None, torch.from_numpy(pairs), backend)
+    found = ops.dual_critical_points(torch.from_numpy(points), ptr, None, torch.from_numpy(links), backend)
     exact = [(Fraction(float(x)), Fraction(float(y))) for x, y in points]
-    for (i, j), given_pair in zip(pairs.tolist(), found.tolist(), strict=True):
-        assert given_pair == _critical(exact, i, j)
+    for (i, j), given_critical in zip(links.tolist(), found.tolist(), strict=True):
+        assert given_critical == _critical(exact, i, j)
 
 
 def _critical(points: list[tuple[Fraction, Fraction]], i: int, j: int) -> list[int]:
@@ -86,25 +86,25 @@ def _critical(points: list[tuple[Fraction, Fraction]], i: int, j: int) -> list[i
 
 @pytest.mark.parametrize("backend", installed_backends())
 @given(st.sampled_from(KINDS), st.integers(0, 10**6), st.integers(1, 30))
-def test_pairs_hold_both_graphs_and_do_not_depend_on_the_order_of_matches(
+def test_links_hold_both_graphs_and_do_not_depend_on_the_order_of_matches(
     backend: str, kind: str, seed: int, n: int
 ) -> None:
     left, right, ptr = _views(kind, seed, n)
     ptr = ptr[[0, -1]]
-    crow0, cols0, crow1, cols1, size, pairs, pair_ptr, *_, edge0, edge1 = ops.soft_match_graphs(
+    crow0, cols0, crow1, cols1, size, links, link_ptr, *_, edge0, edge1 = ops.soft_match_graphs(
         left, right, ptr, None, None, INFINITE, 1e-3, backend
     )
     hard = ops.match_graphs(left, right, ptr, None, None, 1e-3, backend)
     assert all(torch.equal(a, b) for a, b in zip((crow0, cols0, crow1, cols1, size), hard, strict=True))
-    assert pair_ptr.tolist() == [0, len(pairs)]
-    assert bool((pairs[:, 0] < pairs[:, 1]).all())
+    assert link_ptr.tolist() == [0, len(links)]
+    assert bool((links[:, 0] < links[:, 1]).all())
     for crow, cols, is_edge in ((crow0, cols0, edge0), (crow1, cols1, edge1)):
         rows = torch.repeat_interleave(crow.diff())
         edges = {(i, j) for i, j in zip(rows.tolist(), cols.tolist(), strict=True) if i < j}
-        assert edges == set(map(tuple, pairs[is_edge].tolist()))
+        assert edges == set(map(tuple, links[is_edge].tolist()))
     order = torch.from_numpy(np.random.default_rng(seed).permutation(len(left)))
     shuffled = ops.soft_match_graphs(left[order], right[order], ptr, None, None, INFINITE, 1e-3, backend)[5]
-    assert set(map(tuple, order[shuffled].sort(1).values.tolist())) == set(map(tuple, pairs.tolist()))
+    assert set(map(tuple, order[shuffled].sort(1).values.tolist())) == set(map(tuple, links.tolist()))
 
 
 @pytest.mark.parametrize("backend", installed_backends())
@@ -113,48 +113,29 @@ def test_operators_keep_the_rules_of_torch(backend: str) -> None:
     reach = torch.tensor([16.0, 0.0], dtype=torch.float64)
     arguments = (left, right, ptr, None, None, reach, 1e-3, backend)
     torch.library.opcheck(torch.ops.tensor_stereo.soft_match_graphs.default, arguments)
-    pairs, pair_ptr, critical = (ops.soft_match_graphs(*arguments)[k] for k in (5, 6, 7))
-    torch.library.opcheck(torch.ops.tensor_stereo.dual_critical_points.default, (left, ptr, None, pairs, backend))
+    links, link_ptr, critical = (ops.soft_match_graphs(*arguments)[k] for k in (5, 6, 7))
+    torch.library.opcheck(torch.ops.tensor_stereo.dual_critical_points.default, (left, ptr, None, links, backend))
     leaf = left.clone().requires_grad_()
     torch.library.opcheck(
-        torch.ops.tensor_stereo.dual_edge_ratio.default, (leaf, pairs, critical, pair_ptr, 1e3, backend)
+        torch.ops.tensor_stereo.dual_edge_ratio.default, (leaf, links, critical, link_ptr, 1e3, backend)
     )
     torch.library.opcheck(
         torch.ops.tensor_stereo.dual_edge_ratio_backward.default,
-        (left, pairs, critical, pair_ptr, torch.ones(len(pairs), dtype=torch.float64), 1e3, backend),
-    )
-
-
-@NATIVE
-@pytest.mark.parametrize("in_px", [False, True])
-def test_soft_counts_keep_the_rules_of_torch(in_px: bool) -> None:
-    left, right, ptr = _views("uniform", 0, 20)
-    reach = torch.tensor([16.0, 0.0], dtype=torch.float64)
-    _, _, _, _, _, pairs, pair_ptr, *geometry = ops.soft_match_graphs(
-        left, right, ptr, None, None, reach, 1e-3, "native"
-    )
-    leaves = [left.clone().requires_grad_(), right.clone().requires_grad_()]
-    temperature = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
-    arguments = (pairs, *geometry, pair_ptr)
-    settings = (40.0, in_px, 1e3)
-    torch.library.opcheck(torch.ops.tensor_stereo.soft_counts.default, (*leaves, *arguments, temperature, *settings))
-    torch.library.opcheck(
-        torch.ops.tensor_stereo.soft_counts_backward.default,
-        (left, right, *arguments, temperature.detach(), *settings, torch.ones(20, 3, dtype=torch.float64)),
+        (left, links, critical, link_ptr, torch.ones(len(links), dtype=torch.float64), 1e3, backend),
     )
 
 
 @pytest.mark.parametrize(
-    ("pairs", "message"),
+    ("links", "message"),
     [
         (torch.tensor([[0, 0]]), "two distinct points"),
         (torch.tensor([[0, 3]]), "one segment"),
         (torch.tensor([[1, 2]]), "not repeated"),
         (torch.tensor([[0, 9]]), "rows 0..3"),
-        (torch.tensor([0, 1]), "pairs must be"),
+        (torch.tensor([0, 1]), "links must be"),
     ],
 )
-def test_pairs_that_are_none_are_refused(pairs: torch.Tensor, message: str) -> None:
+def test_links_that_are_none_are_refused(links: torch.Tensor, message: str) -> None:
     points = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [5.0, 5.0]])
     with pytest.raises(ValueError, match=message):
-        ops.dual_critical_points(points, torch.tensor([0, 3, 4]), None, pairs, "auto")
+        ops.dual_critical_points(points, torch.tensor([0, 3, 4]), None, links, "auto")

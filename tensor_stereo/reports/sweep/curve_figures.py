@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, PAPER_SPECIFICITY
 from tensor_stereo.reports.sweep.curves import DetectorCurves, ScoreCurve, detector_curves
 from tensor_stereo.reports.sweep.drawing import (
     MAX_SERIES,
     PAPER_CLAIM,
-    PAPER_SENSITIVITY,
-    PAPER_SPECIFICITY,
     RUN_STYLES,
     color_labels,
     distinct_labels,

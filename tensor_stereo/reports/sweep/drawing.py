@@ -13,7 +13,6 @@ from tensor_stereo.reports.sweep.pooling import SETTINGS, settings_label, tellin
 from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.sweep.svg import NUM_COLORS, Key, color_class, legend
 
-PAPER_SENSITIVITY, PAPER_SPECIFICITY = 0.96, 0.70  # Bustos, Vargas & Trujillo, CIARP 2016, in words
 PAPER_CLAIM = "the paper's claim: specificity around .70 at sensitivity up to .96"
 MAX_SERIES = 6  # of one run in one panel
 RUN_STYLES = ("", "dashed")  # lines of run A and run B

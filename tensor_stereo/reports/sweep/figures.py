@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, PAPER_SPECIFICITY
 from tensor_stereo.reports.sweep.drawing import (
     MAX_SERIES,
     PAPER_CLAIM,
-    PAPER_SENSITIVITY,
-    PAPER_SPECIFICITY,
     RUN_STYLES,
     color_labels,
     detector_key,

@@ -11,8 +11,8 @@ import polars as pl
 import torch
 
 from tensor_stereo.configs import DETECTORS, ConsensusConfig
-from tensor_stereo.evaluation.metrics import Confusion, ScoreCounts
-from tensor_stereo.evaluation.trials import SCORE_BINS, SENSITIVITY
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, Confusion, ScoreCounts
+from tensor_stereo.evaluation.trials import SCORE_BINS
 from tensor_stereo.reports.sweep.results import COUNTS
 
 
@@ -172,7 +172,7 @@ def _rates(row: Mapping[str, Any]) -> dict[str, float | None]:
     if row[COUNTS[0]] is None:
         return rates | dict.fromkeys(SCORE_RATES)
     counts = score_counts(row)
-    return rates | {"auc": counts.auc(), "specificity_at_sensitivity_96": counts.specificity_at(SENSITIVITY)}
+    return rates | {"auc": counts.auc(), "specificity_at_sensitivity_96": counts.specificity_at(PAPER_SENSITIVITY)}
 
 
 def with_repeat(results: pl.DataFrame) -> pl.DataFrame:

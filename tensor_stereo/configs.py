@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, NoReturn, get_args
 
-from tensor_stereo.limits import Count, Fraction, OddPx, Positive, Within, check_settings
+from tensor_stereo.limits import Count, Fraction, NotNegative, OddPx, Positive, Within, check_settings
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
@@ -126,16 +126,14 @@ class ConsensusConfig:
     """
 
     tolerance_px: Positive = 0.6  # difference to a neighbour's plane at which agreement has fallen to exp(-1/2)
-    whole_tolerance_px: Positive = 1.0
+    whole_tolerance_px: Positive = 1.0  # the same for keypoints on whole pixels
     row_tolerance_px: Positive | None = 0.25  # row offset that halves the odds; None: the pair is not rectified
-    whole_row_tolerance_px: Positive = 1.5
+    whole_row_tolerance_px: Positive = 1.5  # the same for keypoints on whole pixels
     slope: Positive = 0.2  # expected change of the displacement per px of distance, px/px
     reach: Positive = 2.0  # distance, in edge lengths around the match, at which a neighbour's vote counts half
     doubt: Positive = 1.0  # votes against every match, so that few votes are less than many
-    cost_weight: Annotated[float, Within(0, open_high=True)] = (
-        0.5  # log-odds per standard deviation of the logarithm of the cost
-    )
-    num_rounds: Annotated[int, Within(1, 1000)] = 2
+    cost_weight: NotNegative = 0.5  # log-odds per standard deviation of the logarithm of the cost
+    num_rounds: Annotated[int, Within(1, 1000)] = 2  # of belief
 
     def __post_init__(self) -> None:
         check_settings(self, prefix="ConsensusConfig.")
@@ -315,7 +313,7 @@ class TrialConfig(PipelineConfig):
     """One point of a sweep's grid: a pipeline, and what is done to its putative matches."""
 
     outlier_rate: Fraction = 0.0  # of the matches whose partners in view 1 change places among them
-    noise_px: Annotated[float, Within(0, open_high=True)] = 0.0  # standard deviation added to x and y of both keypoints
+    noise_px: NotNegative = 0.0  # standard deviation added to x and y of both keypoints
     seed: Annotated[int, Within(0, 2**31 - 1)] = 0  # of outliers and noise, together with the name of the pair
     max_error_px: Positive = 1.0  # a match is correct iff its disparity is off by no more
 

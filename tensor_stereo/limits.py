@@ -49,6 +49,7 @@ class Odd:
 
 Fraction = Annotated[float, Within(0, 1)]
 Positive = Annotated[float, Within(0, open_low=True, open_high=True)]
+NotNegative = Annotated[float, Within(0, open_high=True)]
 Count = Annotated[int, Within(1, 2**31 - 1)]
 OddPx = Annotated[int, Odd()]
 

@@ -20,7 +20,7 @@ from tensor_stereo import ops
 from tensor_stereo.configs import COLDEST, HOTTEST, Backend, TemperatureUnit
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.ops import reference_soft
-from tensor_stereo.types import Adjacency, Matches, check_pairs, check_points, check_tie_tolerance, check_unit
+from tensor_stereo.types import Adjacency, Matches, check_links, check_points, check_tie_tolerance, check_unit
 
 SATURATION = 40.0  # |length / temperature| beyond which an adjacency is constant
 REACH = 16.0  # temperatures of negative length below which a link counts as blocked; its adjacency is below 1.2e-7
@@ -176,7 +176,7 @@ def dual_edge_length(
         tensor([0.7500], dtype=torch.float64)
     """
     points = _to_float64("keypoints", keypoints)
-    check_pairs("links", links, len(points))
+    check_links("links", links, len(points))
     ratio = _ratio(points, links, critical, link_ptr, tie_tolerance, backend)
     return ratio * reference_soft.link_length(points, links)
 
@@ -219,7 +219,7 @@ def soft_adjacency(
     """
     check_unit(unit)
     points = _to_float64("keypoints", keypoints)
-    check_pairs("links", links, len(points))
+    check_links("links", links, len(points))
     length = _ratio(points, links, geometry.critical, link_ptr, tie_tolerance, backend)
     if unit == "px":
         length = length * reference_soft.link_length(points, links)

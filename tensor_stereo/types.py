@@ -281,7 +281,7 @@ def check_integer(name: str, values: Tensor) -> None:
         raise TypeError(f"{name} must hold integers, got {values.dtype}")
 
 
-def check_pairs(name: str, pairs: Tensor, num_rows: int) -> None:
+def check_links(name: str, pairs: Tensor, num_rows: int) -> None:
     """Raise unless ``pairs`` is (E, 2) int64 and names rows below ``num_rows``."""
     if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype != torch.int64:
         raise ValueError(f"{name} must be (E, 2) int64, got {tuple(pairs.shape)} {pairs.dtype}")

@@ -69,7 +69,7 @@ void soft_counts_backward(const SoftViews& views, const double* counts_gradient,
             temperature_gradient[range] -= of_exponent * own.exponent / views.temperature;
             const double of_length = of_exponent / views.temperature;  // of the dual length
             views.view[v].add_ratio_gradient(link, of_length * own.length, gradients[v]);
-            if (!views.in_px) continue;
+            if (!views.in_px || own.length == 0) continue;  // points that have moved onto each other have no direction
             const Point i = views.view[v].first(link), j = views.view[v].second(link);
             const double scale = of_length * own.ratio / own.length;
             DualEdges::add(gradients[v], links[2 * link + 1], scale * (j.x - i.x), scale * (j.y - i.y));

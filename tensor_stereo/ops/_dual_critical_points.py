@@ -13,7 +13,7 @@ from tensor_stereo.delaunay.one_to_one import coincident_ids, first_of_coinciden
 from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.ops.segments import pair_of, segments_of, to_points, vertices_of
-from tensor_stereo.types import check_pairs
+from tensor_stereo.types import check_links
 
 
 def _fake(*arguments: Any) -> Tensor:
@@ -42,7 +42,7 @@ def dual_critical_points(keypoints: Tensor, ptr: Tensor, group: Tensor | None, l
     """
     kernels = native(backend)
     points = to_points("keypoints", keypoints, ptr, kernels)
-    check_pairs("links", links, len(points))
+    check_links("links", links, len(points))
     rows = links.numpy(force=True)
     segment = pair_of(ptr) if group is None else segments_of(ptr, group, len(points))
     kept = first_of_coincident(coincident_ids(points, segment))

@@ -9,6 +9,7 @@ import polars as pl
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from tensor_stereo.atomic import whole_file
 from tensor_stereo.classification import verdicts_by_name
 from tensor_stereo.configs import PipelineConfig, describe_settings
 from tensor_stereo.datasets import PairFiles, read_pair
@@ -90,7 +91,8 @@ def classify_files(
     truth = None if pair.disparity_gt is None else matches_against_gt(output.matches, [pair.disparity_gt])
     if out is not None:
         table = match_table(output, config, truth)
-        table.write_csv(out) if out.suffix.casefold() == ".csv" else table.write_parquet(out)
+        with whole_file(out) as part:
+            table.write_csv(part) if out.suffix.casefold() == ".csv" else table.write_parquet(part)
     if figure is not None:
         write_figure(_draw(pair, output, config, truth), figure)
     verdict = output.classification

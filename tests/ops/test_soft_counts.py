@@ -113,12 +113,13 @@ def test_few_matches_and_none_have_defined_counts(backend: str, n: int) -> None:
     assert [gradient.shape for gradient in gradients] == [(0, 2), (0, 2), ()]
 
 
+@pytest.mark.parametrize("backend", installed_backends())
 @pytest.mark.parametrize("in_px", [False, True])
-def test_points_that_have_moved_together_give_no_nan(in_px: bool) -> None:
+def test_points_that_have_moved_together_give_no_nan(in_px: bool, backend: str) -> None:
     points0, points1, *rest = _tensors("uniform", 0, 12, 1.0, 1e-3)
     together = points1.clone()
     together[rest[0][0, 1]] = together[rest[0][0, 0]]  # the graphs are those of before
-    results = _results((points0, together, *rest), SATURATION, in_px, 1e3, "scipy")
+    results = _results((points0, together, *rest), SATURATION, in_px, 1e3, backend)
     assert all(bool(result.isfinite().all()) for result in results)
 
 

@@ -201,7 +201,7 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
     known = json.loads((out / "config.json").read_text())
     with RunStore(out, known, table) as store:
         for unit in range(count):
-            store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0}]))
+            store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0, "num_valid": 1}]))
     command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml")]
     command += ["--manifest", str(tmp_path / "m.parquet"), "--out", str(out)]
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)

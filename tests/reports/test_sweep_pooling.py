@@ -8,7 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES
+from tensor_stereo.configs import TrialConfig
+from tensor_stereo.evaluation.dataset import ROW_SCHEMA
+from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES, setting_columns
 from tensor_stereo.reports.sweep.curves import detector_curves
 from tensor_stereo.reports.sweep.pooling import (
     CELLS,
@@ -235,3 +237,8 @@ def test_empty_results_pool_to_nothing(results: pl.DataFrame) -> None:
 
 def test_detectors_come_in_the_order_of_the_paper() -> None:
     assert order_detectors({"gftt", "surf", "sift", "fast", "orb"}) == ["sift", "fast", "surf", "gftt", "orb"]
+
+
+def test_every_column_of_settings_has_a_heading() -> None:
+    assert set(SETTINGS) == set(setting_columns(TrialConfig()))
+    assert set(SETTINGS) <= set(ROW_SCHEMA)

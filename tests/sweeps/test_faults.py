@@ -170,7 +170,7 @@ def test_only_the_unit_that_kills_its_worker_fails(inputs: Inputs, expected: pl.
 
 def test_a_worker_that_dies_at_work_is_noticed_and_replaced(inputs: Inputs) -> None:
     """Killed between the first byte of a result, which is larger than a pipe holds, and its last."""
-    grid = {"verdict": "cardinality", "score": "topology", "seed": list(range(60)), "outlier_rate": 0.5}
+    grid = {"verdict": "cardinality", "score": "topology", "seed": list(range(240)), "outlier_rate": 0.5}
     config = SweepConfig(expand_grid([grid]), export_matches=True)
     plan = build_plan(config, read_manifest(inputs.manifest))
     engine = LocalEngine(config, 1)
@@ -186,7 +186,7 @@ def test_a_worker_that_dies_at_work_is_noticed_and_replaced(inputs: Inputs) -> N
         assert engine.collect(PATIENCE_S) == []
         (outcome,) = engine.collect(PATIENCE_S)
         assert outcome.results is not None
-        assert len(outcome.results[0].rows) == 60
+        assert len(outcome.results[0].rows) == 240
     finally:
         engine.close()
 

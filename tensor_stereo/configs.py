@@ -103,7 +103,9 @@ class MatchingConfig:
         check_settings(self, prefix="MatchingConfig.")
         low, high = self.min_disparity_px, self.max_disparity_px
         if low is not None and high is not None and low > high:
-            raise ValueError(f"MatchingConfig.min_disparity_px must be at most max_disparity_px, got {low} > {high}")
+            raise ValueError(
+                f"MatchingConfig.min_disparity_px must be at most MatchingConfig.max_disparity_px, got {low} > {high}"
+            )
 
 
 @dataclass(frozen=True)
@@ -181,9 +183,7 @@ class FilterConfig:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        given = [name for name in CUTS if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"{given[1]} must be None beside {given[0]}, got {getattr(self, given[1])}")
+        given = _check_cuts(self)
         if self.verdict != "score":
             for name in given:
                 raise ValueError(f"{name} needs the verdict 'score', got {self.verdict!r} with {getattr(self, name)}")
@@ -212,6 +212,14 @@ class FilterConfig:
         return self.resolved_score in ("consensus", "learned")
 
 
+def _check_cuts(config: FilterConfig) -> list[str]:
+    """The ways from a score to a verdict that are given; raises if there are several."""
+    given = [name for name in CUTS if getattr(config, name) is not None]
+    if len(given) > 1:
+        raise ValueError(f"{given[1]} must be None beside {given[0]}, got {getattr(config, given[1])}")
+    return given
+
+
 @dataclass(frozen=True)
 class FileFilterConfig(FilterConfig):
     """What decides about the matches of a file, whose form can choose the verdict.
@@ -226,14 +234,15 @@ class FileFilterConfig(FilterConfig):
     def __post_init__(self) -> None:
         if self.verdict is None:
             check_settings(self)
+            _check_cuts(self)
         else:
             super().__post_init__()
 
     def resolve(self, *, rectified: bool) -> FilterConfig:
         """The settings for a file.
 
-        Files of pairs that are not rectified get a ``consensus`` score without row offsets, unless a score or a verdict
-        of the paper is named.
+        Files of pairs that are not rectified get a ``consensus`` score, unless a score or a verdict of the paper is
+        named. That score looks at no row offset there, unless ``row_tolerance_px`` differs from its default.
 
         Args:
             rectified: Whether the form of the file promises rectified pairs.
@@ -249,8 +258,8 @@ class FileFilterConfig(FilterConfig):
             settings["verdict"] = "score" if rectified else "cardinality"
         if not rectified and self.score == "auto" and self.verdict not in RESTRICTIONS:
             settings["score"] = "consensus"
-        if not rectified and self.consensus == ConsensusConfig():
-            settings["consensus"] = UNRECTIFIED
+        if not rectified and self.consensus.row_tolerance_px == ConsensusConfig().row_tolerance_px:
+            settings["consensus"] = replace(self.consensus, row_tolerance_px=None)
         return FilterConfig(**settings)
 
 
@@ -339,6 +348,12 @@ class EvaluationConfig(StepConfigs):
     detectors: tuple[Detector, ...] = DETECTORS
     max_error_px: Positive = 1.0  # a match is correct iff its disparity is off by no more
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.detectors or len(set(self.detectors)) < len(self.detectors):
+            given = ", ".join(self.detectors) or "none"
+            raise ValueError(f"detectors must name at least one, and each once, got {given}")
+
     @property
     def restriction(self) -> Restriction:
         """The restriction of the paper that the tables show."""
@@ -355,14 +370,8 @@ class EvaluationConfig(StepConfigs):
         trials = []
         if trial.verdict == "score":
             trials.append(trial)
-            trial = replace(
-                trial,
-                verdict=self.restriction,
-                score="none",
-                threshold=None,
-                target_sensitivity=None,
-                min_precision=None,
-            )
+            no_cuts: dict[str, Any] = dict.fromkeys(CUTS)
+            trial = replace(trial, verdict=self.restriction, score="none", **no_cuts)
         for constrained in (False, True):
             trials += [replace(trial, verdict=name, constrained=constrained) for name in RESTRICTIONS]
         return tuple(trials)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, is_dataclass
 from functools import cache
-from numbers import Integral, Real
+from numbers import Integral, Number, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -74,7 +74,10 @@ def check_settings(settings: Any, *, prefix: str = "") -> None:
     """
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():
-        _check(f"{prefix}{name}", getattr(settings, name), hint)
+        value = getattr(settings, name)
+        _check(f"{prefix}{name}", value, hint)
+        if isinstance(value, Number) and type(value).__module__ == "numpy":
+            object.__setattr__(settings, name, value.item())  # type: ignore[attr-defined]  # so that JSON can hold it
 
 
 @cache

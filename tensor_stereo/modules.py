@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded, lengths_to_ptr, select_matches
 from tensor_stereo.classification import apply_score, classify_graphs
-from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FilterConfig
+from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FileFilterConfig, FilterConfig
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.by_name import score_matches
@@ -64,7 +64,8 @@ class DelaunayFilter(nn.Module):
         straight_through: Whether the score is the verdict, with the gradient of the soft score.
         learnable_temperature: Whether the temperature of ``topology`` is a parameter; its logarithm is what is learnt.
         trainable: Whether the weights of ``learned`` have gradients. They are parameters, and frozen unless this is
-            set.
+            set. Those that look at images get a gradient only where there are images, and those of the first beliefs
+            none.
         **settings: Fields of :class:`tensor_stereo.FilterConfig` that replace those of ``config``:
 
             ``verdict``: ``score``, or ``adjacency`` or ``cardinality``, the paper's Restrictions 1 and 2.
@@ -130,14 +131,16 @@ class DelaunayFilter(nn.Module):
             if given and score not in needed:
                 raise ValueError(f"{name} must be False where the score is {score!r}")
         self.straight_through = straight_through
-        logarithm = torch.tensor(config.temperature, dtype=torch.float64).log()
-        if learnable_temperature:
-            self.log_temperature = nn.Parameter(logarithm)
-        else:
-            self.register_buffer("log_temperature", logarithm)
         self.network: LearnedScore | None = None
-        if score == "learned":
-            self.network = copy.deepcopy(load_learned()).requires_grad_(trainable)
+        with torch.inference_mode(False):  # tensors that were made in it could never take part in a gradient
+            logarithm = torch.tensor(config.temperature, dtype=torch.float64).log()
+            if learnable_temperature:
+                self.log_temperature = nn.Parameter(logarithm)
+            else:
+                self.register_buffer("log_temperature", logarithm)
+            if score == "learned":
+                self.network = copy.deepcopy(load_learned()).requires_grad_(trainable)
+        self.register_load_state_dict_pre_hook(_refuse_other_score)  # type: ignore[no-untyped-call]
 
     @property
     def temperature(self) -> Tensor:
@@ -166,7 +169,11 @@ class DelaunayFilter(nn.Module):
         Raises:
             ValueError: naming the setting that differs.
         """
-        known, mine = json.loads(bytes(state.tolist())), self._fingerprint()
+        mine = self._fingerprint()
+        try:
+            known = json.loads(bytes(state.to(torch.uint8).tolist()))
+        except ValueError as error:
+            raise ValueError("state_dict holds no readable fingerprint of a DelaunayFilter's settings") from error
         for name in sorted(known.keys() | mine.keys(), key=lambda name: (name != "score", name)):
             if known.get(name) != mine.get(name):
                 given = f"{known.get(name)!r}, but this filter has {mine.get(name)!r}"
@@ -272,17 +279,27 @@ class DelaunayFilter(nn.Module):
         score, graphs = score_matches(
             matches, config, images=images, evidence=evidence, temperature=self.temperature, network=self.network
         )
-        device = matches.keypoints0.device.type
-        low = torch.is_autocast_enabled(device)
-        score = score.to(torch.get_autocast_dtype(device) if low else matches.keypoints0.dtype)
+        score = score.to(matches.keypoints0.dtype)
         verdict, score = apply_score(classify_graphs(graphs, config), score, matches.ptr, config)
+        device = matches.keypoints0.device.type
+        if torch.is_autocast_enabled(device):  # after the verdict, which no rounding shall change
+            score = score.to(torch.get_autocast_dtype(device))
         if self.straight_through:
             score = score + (verdict.inlier.to(score.dtype) - score).detach()
         return FilterOutput(verdict.inlier, score, verdict.relation, matches)
 
 
+def _refuse_other_score(module: DelaunayFilter, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Look at the fingerprint before anything is loaded."""
+    state = state_dict.get(f"{prefix}_extra_state")
+    if state is not None:
+        module.set_extra_state(state)
+
+
 def _merge(config: FilterConfig, settings: dict[str, Any]) -> FilterConfig:
     """The same settings with others in their place; raises for names that are none."""
+    if not isinstance(config, FilterConfig) or isinstance(config, FileFilterConfig):
+        raise TypeError(f"config must be a FilterConfig, got {config!r}; other settings are keyword arguments")
     names = [f.name for f in fields(FilterConfig)]
     for name in settings:
         if name in _RENAMED:

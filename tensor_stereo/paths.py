@@ -75,6 +75,17 @@ def prepare_target(name: str, path: Path, endings: Sequence[str] = ()) -> Path:
     return path
 
 
+def check_apart(name: str, path: Path, sources: dict[str, Path | None]) -> None:
+    """Raise if a file that shall be written is one of those that are read.
+
+    Raises:
+        ValueError: naming both arguments.
+    """
+    for other, source in sources.items():
+        if source is not None and (source.resolve() == path.resolve() or (path.exists() and path.samefile(source))):
+            raise ValueError(f"{name} must be another file than {other}, got {path} for both")
+
+
 def prepare_folder(name: str, path: Path) -> Path:
     """Make a folder that shall be written to, and raise unless it can be.
 

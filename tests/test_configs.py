@@ -113,7 +113,7 @@ def test_numbers_of_numpy_are_numbers() -> None:
 
 
 def test_bounds_of_the_gates_must_be_in_order() -> None:
-    with pytest.raises(ValueError, match=r"min_disparity_px must be at most max_disparity_px, got 5\.0 > 4\.0"):
+    with pytest.raises(ValueError, match=r"must be at most MatchingConfig\.max_disparity_px, got 5\.0 > 4\.0"):
         MatchingConfig(min_disparity_px=5.0, max_disparity_px=4.0)
 
 
@@ -193,3 +193,32 @@ def test_files_of_any_two_views_look_at_no_rows_unless_they_are_told_to() -> Non
     assert configs.FileFilterConfig(verdict="adjacency").resolve(rectified=False).resolved_score == "none"
     told = ts.ConsensusConfig(row_tolerance_px=5.0)
     assert configs.FileFilterConfig(consensus=told).resolve(rectified=False).consensus == told
+
+
+def test_settings_for_files_are_not_those_of_the_module() -> None:
+    for config in (configs.FileFilterConfig(), "cardinality", {"verdict": "cardinality"}):
+        with pytest.raises(TypeError, match="config must be a FilterConfig"):
+            ts.DelaunayFilter(config)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="min_precision must be None beside threshold"):
+        configs.FileFilterConfig(threshold=0.3, min_precision=0.9)
+
+
+def test_any_two_views_keep_the_settings_of_the_consensus() -> None:
+    config = configs.FileFilterConfig(score="consensus", consensus=ts.ConsensusConfig(slope=0.3, row_tolerance_px=None))
+    resolved = config.resolve(rectified=False)
+    assert resolved.consensus.slope == 0.3
+    assert resolved.consensus.row_tolerance_px is None
+
+
+@pytest.mark.parametrize("detectors", [(), ("fast", "fast")])
+def test_an_evaluation_needs_each_detector_once(detectors: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="detectors must"):
+        EvaluationConfig(detectors=detectors)
+
+
+def test_numbers_of_numpy_become_those_of_python() -> None:
+    config = FilterConfig(tie_tolerance=np.float32(0.25), min_group_size=np.int64(3))  # type: ignore[arg-type]
+    assert type(config.tie_tolerance) is float
+    assert type(config.min_group_size) is int
+    module = ts.DelaunayFilter(config)
+    module.load_state_dict(module.state_dict())  # the fingerprint is JSON

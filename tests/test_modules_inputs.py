@@ -96,7 +96,7 @@ def test_images_that_do_not_fit_are_named() -> None:
     with pytest.raises(ValueError, match=r"floating-point images must lie in \[0, 1\]"):
         module(matches, images0=image0.float(), images1=image1.float())
     for other in (ts.DelaunayFilter(score="consensus"), ts.DelaunayFilter(verdict="adjacency")):
-        with pytest.raises(TypeError, match="images must be None where the score is"):
+        with pytest.raises(TypeError, match="images0 and images1 must be None where the score is"):
             other(matches, images0=image0, images1=image1)
     with pytest.raises(TypeError, match="images0 must be None where there is no score"):
         ts.DelaunayFilter(verdict="adjacency", score="none")(matches, images0=image0, images1=image1)
@@ -246,3 +246,51 @@ def test_coordinates_that_are_no_pixels_are_marked(score: str) -> None:
     verdict = ts.DelaunayFilter(verdict="cardinality")((LEFT * 1e18).double(), (RIGHT * 1e18).double())
     assert bool(verdict.inlier.all())  # the set test has no unit
     assert bool(verdict.score.isfinite().all())
+
+
+def test_images_of_another_size_than_the_keypoints_are_marked() -> None:
+    matches, image0, image1 = rendered(0)
+    assert matches.cost is not None
+    arguments = (matches.keypoints0, matches.keypoints1)
+    with pytest.warns(DomainWarning, match="many of pair 0 lie outside"):
+        ts.DelaunayFilter()(
+            *arguments,
+            cost=matches.cost,
+            images0=image0[:, ::2, ::2].contiguous(),
+            images1=image1[:, ::2, ::2].contiguous(),
+        )
+
+
+@pytest.mark.parametrize("score", ["learned", "consensus"])
+def test_autocast_changes_no_verdict(score: str) -> None:
+    """The cuts below are scores of the matches, so that one that was rounded before it is compared falls below."""
+    left, right = scene(3, 100)
+    right = torch.where(torch.arange(100)[:, None] % 3 == 0, right + 2 * left.flip(1) / 100, right)
+    for cut in ts.DelaunayFilter(score=score)(left, right).score.sort().values[::10].tolist():
+        module = ts.DelaunayFilter(score=score, threshold=cut)
+        full = module(left, right)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            low = module(left, right)
+        assert low.score.dtype == torch.bfloat16
+        assert torch.equal(low.inlier, full.inlier)
+
+
+def test_a_filter_made_in_inference_mode_can_be_trained() -> None:
+    with torch.inference_mode():
+        module = ts.DelaunayFilter(trainable=True)
+    module(LEFT, RIGHT).score.sum().backward()
+    assert any(parameter.grad is not None for parameter in module.parameters())
+
+
+def test_a_refused_state_changes_nothing() -> None:
+    module = ts.DelaunayFilter(verdict="adjacency", temperature=3.0)
+    before = module.temperature.clone()
+    other = ts.DelaunayFilter(verdict="adjacency", temperature=0.5, temperature_unit="px").state_dict()
+    with pytest.raises(ValueError, match="temperature_unit"):
+        module.load_state_dict(other)
+    assert torch.equal(module.temperature, before)
+    state = module.state_dict()
+    module.load_state_dict({name: value.float() for name, value in state.items()})  # as a cast of a checkpoint does
+    state["_extra_state"] = torch.zeros_like(state["_extra_state"])
+    with pytest.raises(ValueError, match="no readable fingerprint"):
+        module.load_state_dict(state)

@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         run = _runner(command)
         with _domain_warnings_in_one_line():
             code = run(command)
-    except (ValueError, TypeError, ImportError, SweepError, OSError) as error:
+    except (ValueError, TypeError, ImportError, SweepError, OSError, UserWarning) as error:
         sys.exit(fail(_one_line(error), BAD_INPUT))
     except KeyboardInterrupt:
         sys.exit(fail("interrupted", INTERRUPTED))
@@ -81,9 +81,11 @@ def _parse(arguments: Sequence[str] | None) -> Any:
             )
     except SystemExit:
         text = " ".join(line.strip("│╭╮╰╯─ ") for line in said.getvalue().splitlines())
-        wrapped = re.search(r"Error parsing \S+: (\w+Config\..+?, got \S+)", text)
+        wrapped = re.search(r"Error parsing \S+: (\w+Config\..+?)\s+For full helptext", text)
         if wrapped:
             raise ValueError(wrapped[1]) from None
+        if "--restriction" in text and "Unrecognized" in text:
+            raise ValueError("--restriction is --verdict now") from None
         print(said.getvalue(), end="", file=sys.stderr)
         raise
 

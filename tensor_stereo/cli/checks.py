@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.datasets.files import check_gt_scale
 from tensor_stereo.interop.formats import check_files
-from tensor_stereo.paths import check_folder, check_source, prepare_folder, prepare_target
+from tensor_stereo.paths import check_apart, check_folder, check_source, prepare_folder, prepare_target
 
 TABLES, FIGURES, IMAGES = (".csv", ".parquet"), (".png",), ()
 
@@ -36,11 +38,15 @@ def _check_classify(command: Classify) -> None:
     for name, endings in (("out", TABLES), ("figure", FIGURES)):
         path = getattr(command, name)
         if path is not None:
+            sources = {"left": command.left, "right": command.right, "disparity_gt": command.disparity_gt}
+            check_apart(name, path, sources)
             prepare_target(name, path, endings)
+    check_gt_scale(command.gt_scale)
 
 
 def _check_evaluate(command: Evaluate) -> None:
     check_folder("root", command.root)
+    check_gt_scale(command.gt_scale)
     if command.out is not None:
         prepare_folder("out", command.out)
 
@@ -49,6 +55,18 @@ def _check_filter(command: Filter) -> None:
     ending = check_files(command.matches, command.out, command.keypoints)
     if ending != ".npz":  # an archive is opened later, to see what form it has
         command.config.resolve(rectified=ending not in (".h5", ".db"))
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """``i/n`` as two numbers.
+
+    >>> parse_shard("1/4")
+    (1, 4)
+    """
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ValueError(f"shard must be i/n with 1 <= i <= n, such as 1/4, got {text!r}")
+    return int(match[1]), int(match[2])
 
 
 def _check_download(command: Download) -> None:
@@ -68,6 +86,8 @@ def _check_index(command: Index) -> None:
 
 
 def _check_render(command: Render) -> None:
+    if command.num_pairs < 1:
+        raise ValueError(f"num_pairs must be at least 1, got {command.num_pairs}")
     prepare_folder("out", command.out)
 
 
@@ -86,6 +106,11 @@ def _check_sweep(command: Sweep) -> None:
     from tensor_stereo.sweeps.grid import read_grid
 
     read_grid(command.settings)
+    parse_shard(command.shard)
+    for name, least in (("workers", 1), ("limit", 0)):
+        value = getattr(command, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}")
     check_source("manifest", command.manifest, (".parquet",))
     if not command.dry_run:
         prepare_folder("out", command.out)

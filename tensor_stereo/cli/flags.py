@@ -22,15 +22,23 @@ def name_flags(message: str) -> str:
     >>> name_flags("min_precision needs the verdict 'score', got 'cardinality' with 0.9")
     "--min-precision needs --verdict score, got 'cardinality' with 0.9"
     """
+    toml = re.match(r"\S+\.toml: ", message)
     for kind, prefix in _sections().items():
+        if toml:  # settings of a sweep are keys
+            message = re.sub(rf"\b{kind}\.(?=\w)", f"{prefix}.", message)
+            continue
         message = re.sub(rf"\b{kind}\.(\w+)", lambda found, prefix=prefix: _flag(f"{prefix}.{found[1]}"), message)  # type: ignore[misc]
+    if toml:
+        return message
     names = "|".join(sorted(_arguments(), key=len, reverse=True))
-    message = re.sub(rf"^({names})(?=:? (?!and\b))", lambda found: _flag(found[1]), message)
+    message = re.sub(rf"^({names})(?=:| must\b| needs\b)", lambda found: _flag(found[1]), message)
     message = re.sub(rf"(?<=; )({names})(?= needs)", lambda found: _flag(found[1]), message)
+    message = re.sub(r"(?<= as )(source)(?= does)", lambda found: _flag(found[1]), message)
     message = re.sub(r"(?<=another file than )(\w+)", lambda found: _flag(found[1]), message)
     message = re.sub(rf"(?<=must be None beside )({names})\b", lambda found: _flag(found[1]), message)
+    message = message.replace("--gt-scale (--gt-scale)", "--gt-scale")
     return message.replace("the verdict 'score'", "--verdict score").replace(
-        "consensus=UNRECTIFIED, or the verdict 'cardinality'",
+        "the score 'consensus' with consensus=UNRECTIFIED, or the verdict 'cardinality'",
         "--score consensus --consensus.row-tolerance-px None, or --verdict cardinality",
     )
 

@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -41,8 +42,7 @@ def _run_demo(command: Demo) -> int:
 
 
 def _run_evaluate(command: Evaluate) -> int:
-    from tensor_stereo.datasets import PairDataset, find_pairs
-    from tensor_stereo.reports.evaluation import write_errors, write_evaluation
+    from tensor_stereo.datasets.discovery import find_pairs
 
     config = command.config
     if command.preset == "paper":
@@ -53,16 +53,28 @@ def _run_evaluate(command: Evaluate) -> int:
         return fail(f"none of the {len(found)} pairs below {command.root} has ground truth, which an evaluation needs")
     if len(files) < len(found):
         print(f"{len(found) - len(files)} of {len(found)} pairs have no ground truth and are left out", file=sys.stderr)
+    from tensor_stereo.datasets import PairDataset
+    from tensor_stereo.reports.evaluation import write_errors, write_evaluation
+
     source = {"root": str(command.root), "scenes": [f"{pair.dataset}/{pair.scene}" for pair in files]}
     errors: dict[str, str] = {}
-    results = _evaluate(PairDataset(files), config, errors)
-    tables = write_evaluation(results, config, source=source, out=command.out)
+    num_known = 0
+
+    def counted() -> Iterator[Any]:
+        nonlocal num_known
+        for result in _evaluate(PairDataset(files), config, errors):
+            num_known += int(result.trials[0].valid.sum())
+            yield result
+
+    tables = write_evaluation(counted(), config, source=source, out=command.out)
     if len(errors) < len(files):
         _print_tables(tables)
+    if command.out is not None:
+        write_errors(errors, command.out)
     if errors:
-        if command.out is not None:
-            write_errors(errors, command.out)
         return fail(f"{len(errors)} of {len(files)} pairs failed: {most_frequent(errors.values())}")
+    if not num_known:
+        return fail(f"no match of the {len(files)} pairs has known ground truth, so there are no rates")
     return OK
 
 
@@ -109,7 +121,7 @@ def _run_report(command: Report) -> int:
     runs = [load_run(run) for run in command.runs]
     out = command.out
     if out is None:
-        names = [run.resolve().name for run in command.runs]
+        names = _tell_apart([run.resolve() for run in command.runs])
         out = command.runs[-1] if len(names) == 1 else command.runs[-1].parent / f"{names[0]}-and-{names[1]}"
     for path in write_report(runs, out):
         print(path)
@@ -118,6 +130,14 @@ def _run_report(command: Report) -> int:
         counts = f"{len(pairs[0])} and {len(pairs[1])}"
         return fail(f"{command.runs[0]} and {command.runs[1]} have no pair in common, of {counts}")
     return OK
+
+
+def _tell_apart(runs: list[Path]) -> list[str]:
+    """Names of run folders, with as many of the folders above as they need to differ."""
+    depth = 1
+    while len(runs) == 2 and runs[0] != runs[1] and runs[0].parts[-depth:] == runs[1].parts[-depth:]:
+        depth += 1
+    return ["-".join(part.strip("/") for part in run.parts[-depth:]) for run in runs]
 
 
 def _run_classify(command: Classify) -> int:

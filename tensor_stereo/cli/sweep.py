@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 from pathlib import Path
 
+from tensor_stereo.cli.checks import parse_shard
 from tensor_stereo.cli.commands import Sweep
 from tensor_stereo.cli.endings import INTERRUPTED, OK, fail, most_frequent
 from tensor_stereo.cli.progress import describe_time, show_progress
@@ -21,7 +21,7 @@ from tensor_stereo.sweeps.units import run_tasks
 def run_sweep_command(command: Sweep) -> int:
     """Run a sweep; 0 if every unit is done, 1 if some failed, 130 if it was interrupted."""
     config = read_grid(command.settings)
-    shard = _parse_shard(command.shard)
+    shard = parse_shard(command.shard)
     if command.dry_run:
         print_plan(build_plan(config, read_manifest(command.manifest, check_files=False)), shard)
         return OK
@@ -91,10 +91,3 @@ def _describe(state: SweepProgress) -> str:
     left = "" if math.isnan(state.seconds_left) else f", {describe_time(state.seconds_left)} left"
     failed = f", {state.num_failed} failed" if state.num_failed else ""
     return f"{state.units_per_second:.1f} units/s{left}{failed}"
-
-
-def _parse_shard(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)/(\d+)", text)
-    if match is None:
-        raise ValueError(f"shard must be i/n, as 1/4, got {text!r}")
-    return int(match[1]), int(match[2])

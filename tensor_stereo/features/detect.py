@@ -1,4 +1,4 @@
-"""One door to all detectors, each of which is imported when it is first used."""
+"""One function for all detectors, each of which is imported when it is first used."""
 
 from __future__ import annotations
 

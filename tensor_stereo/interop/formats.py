@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tensor_stereo.paths import check_source, prepare_target
+from tensor_stereo.paths import check_apart, check_source, prepare_target
 
 # Ending -> first bytes of such a file, and what it is called.
 FORMATS = {
@@ -39,8 +39,7 @@ def check_files(source: Path, out: Path, keypoints: Path | None) -> str:
         if path is None:
             continue
         check_source(name, path)
-        if path.resolve() == out.resolve() or (out.exists() and out.samefile(path)):
-            raise ValueError(f"out must be another file than {name}, got {out} for both")
+        check_apart("out", out, {name: path})
         first, called = FORMATS[kind]
         with path.open("rb") as file:
             if file.read(len(first)) != first:

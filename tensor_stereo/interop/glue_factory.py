@@ -8,13 +8,14 @@ are half a pixel larger than those of this library. The converters leave them so
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.configs import UNRECTIFIED, ConsensusConfig
+from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.modules import DelaunayFilter, FilterOutput
 from tensor_stereo.types import Matches, check_mask, check_tensor, check_vector
 
@@ -23,7 +24,7 @@ _ENTRIES = (
     *("matches0", "matches1", "matching_scores0", "matching_scores1"),
 )
 # Entries that glue-factory itself puts into the configuration of a component.
-_PIPELINE_KEYS = ("name", "trainable", "freeze_batch_normalization", "timeit", "apply_loss", "visualize")
+_PIPELINE_KEYS = ("name", "freeze_batch_normalization", "timeit", "apply_loss", "visualize")
 
 
 def from_glue_factory(data: Mapping[str, Any]) -> tuple[Matches, Tensor]:
@@ -201,8 +202,10 @@ class GlueFactoryFilter(nn.Module):
         Without any setting it is :func:`two_view_filter`.
         """
         settings = {name: value for name, value in conf.items() if name not in _PIPELINE_KEYS}
-        if isinstance(settings.get("consensus"), Mapping):
-            settings["consensus"] = ConsensusConfig(**settings["consensus"])
+        if not settings.get("trainable"):  # glue-factory writes it into every component
+            settings.pop("trainable", None)
+        if "consensus" in settings:  # of any two views, unless a tolerance of rows is named
+            settings["consensus"] = replace(UNRECTIFIED, **(settings["consensus"] or {}))
         return cls(two_view_filter(**settings))
 
     def forward(self, data: Mapping[str, Any]) -> dict[str, Tensor]:

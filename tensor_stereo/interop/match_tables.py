@@ -24,7 +24,7 @@ from tensor_stereo.ops.segments import check_range
 from tensor_stereo.types import Matches, Relation
 
 _POINTS = ("x0", "y0", "x1", "y1")
-_RESULTS = ("score", "probability", "inlier_adjacency", "inlier_cardinality", "inlier_score")
+_OF_CLASSIFY = ("inlier_adjacency", "inlier_cardinality")  # columns that nothing else writes
 # Polars would inflate such a file, whatever its ending says, and to any size: gzip, zlib, Zstandard.
 _COMPRESSED = (b"\x1f\x8b", b"x\x01", b"x\x9c", b"x\xda", b"\x28\xb5\x2f\xfd")
 # Prints the number of rows that the file claims, then decodes it all.
@@ -54,8 +54,8 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     verdicts = filter_matches(_to_matches(source, table, pair, order), run)
     verdicts = verdicts.take(np.argsort(order, kind="stable"))
     names = {relation.value: relation.name.lower() for relation in Relation}
-    earlier = [name for name in table.columns if name in _RESULTS]  # of classify or of another filter
-    table = table.drop(name for name in earlier if name != "score" or verdicts.score is None)
+    if set(_OF_CLASSIFY) <= set(table.columns):  # its verdicts are replaced by those of this filter
+        table = table.drop("probability", "score", "inlier_score", *_OF_CLASSIFY, strict=False)
     table = table.with_columns(
         pl.Series("inlier", verdicts.inlier),
         *([] if verdicts.score is None else [pl.Series("score", verdicts.score)]),

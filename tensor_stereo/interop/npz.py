@@ -71,7 +71,7 @@ def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
             kind = members["keypoints0"].compress_type
             with zipfile.ZipFile(target, "w", kind) as result:
                 for name, info in members.items():
-                    if name not in Verdicts._fields:
+                    if name not in Verdicts._fields or (name == "score" and verdicts.score is None):
                         _copy_member(archive, info, result)
                 for name, values in _to_rows(arrays, verdicts)._asdict().items():
                     if values is None:

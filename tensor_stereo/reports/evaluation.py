@@ -61,7 +61,10 @@ def write_evaluation(
 
 
 def write_errors(errors: Mapping[str, str], out: Path) -> None:
-    """Write the reason why each of some pairs failed, by its name, to errors.json."""
+    """Write the reason why each of some pairs failed, by its name, to errors.json; of no errors there is no file."""
+    if not errors:
+        (out / "errors.json").unlink(missing_ok=True)
+        return
     (out / "errors.json").write_text(json.dumps(dict(errors), indent=1) + "\n")
 
 

@@ -14,10 +14,11 @@ from tensor_stereo.classification import verdicts_by_name
 from tensor_stereo.configs import PipelineConfig, describe_settings
 from tensor_stereo.datasets import PairFiles, read_pair
 from tensor_stereo.datasets.discovery import find_scale
+from tensor_stereo.datasets.files import check_gt_scale
 from tensor_stereo.evaluation.metrics import Rates, match_rates, matches_against_gt
 from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
-from tensor_stereo.paths import prepare_target
+from tensor_stereo.paths import check_apart, prepare_target
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.types import Relation, StereoPair
@@ -83,7 +84,11 @@ def classify_files(
     disparity_gt, out, figure = (None if path is None else Path(path) for path in (disparity_gt, out, figure))
     for name, path, endings in (("out", out, ENDINGS), ("figure", figure, (".png",))):
         if path is not None:
+            check_apart(name, path, {"left": left, "right": right, "disparity_gt": disparity_gt})
             prepare_target(name, path, endings)
+    check_gt_scale(gt_scale)
+    if gt_scale is not None and (disparity_gt is None or disparity_gt.suffix.casefold() == ".pfm"):
+        raise ValueError(f"gt_scale must be None without disparity_gt in a PNG file, got {gt_scale}")
     if disparity_gt is not None and gt_scale is None:
         gt_scale = find_scale(left, disparity_gt)
     pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale))

@@ -9,7 +9,7 @@ from torch import Tensor
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores.consensus import consensus_score
-from tensor_stereo.scores.domain import check_domain
+from tensor_stereo.scores.domain import check_domain, check_images
 from tensor_stereo.scores.image_evidence import ImageEvidence, measure_images
 from tensor_stereo.scores.learned import LearnedScore, score_learned
 from tensor_stereo.soft import build_soft_graphs, count_soft_neighbors, soft_jaccard
@@ -58,7 +58,7 @@ def score_matches(
     """
     config = config or FilterConfig()
     name = config.resolved_score
-    for argument, value in (("images", images), ("evidence", evidence)):
+    for argument, value in (("images0 and images1", images), ("evidence", evidence)):
         if value is not None and name != "learned":
             raise TypeError(f"{argument} must be None where the score is {name!r}, which looks at no image")
     if images is not None and evidence is not None:
@@ -77,5 +77,6 @@ def score_matches(
     if name == "consensus":
         return consensus_score(matches, graphs, config), graphs
     if images is not None:
+        check_images(matches, images)
         evidence = measure_images(*images, matches, graphs)
     return score_learned(matches, graphs, evidence, config, network=network), graphs

@@ -1,4 +1,4 @@
-"""Verdicts that aim at a rate: what a calibrated score lets expect, and the matches of each pair that fulfil it."""
+"""Probabilities from beliefs, and verdicts that aim at an expected precision or sensitivity."""
 
 from __future__ import annotations
 

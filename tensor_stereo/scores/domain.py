@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -59,7 +60,34 @@ def check_domain(matches: Matches, graphs: MatchGraphs, config: FilterConfig) ->
     if off:
         message = (
             f"the score expects rectified pairs, but the matches of {_count(off, matches)} that agree with their "
-            "neighbours lie off their rows; rectify, or set consensus=UNRECTIFIED, or the verdict 'cardinality'"
+            "neighbours lie off their rows; rectify, or set the score 'consensus' with consensus=UNRECTIFIED, or the "
+            "verdict 'cardinality'"
+        )
+        warnings.warn(message, DomainWarning, stacklevel=3)
+
+
+def check_images(matches: Matches, images: tuple[Sequence[Tensor], Sequence[Tensor]]) -> None:
+    """Warn where keypoints lie outside of their images, as they do if the images have been resized.
+
+    Args:
+        matches: B pairs.
+        images: The B images (C, H, W) of view 0 and of view 1.
+
+    Warns:
+        DomainWarning: if of some pair more than a tenth of the keypoints of a view lie outside.
+    """
+    outside: list[int] = []
+    for name, view in (("keypoints0", images[0]), ("keypoints1", images[1])):
+        points = getattr(matches, name).detach()
+        size = points.new_tensor([[image.shape[-1], image.shape[-2]] for image in view]).reshape(-1, 2)
+        batch = ptr_to_batch(matches.ptr)
+        beyond = ((points < -1) | (points > size.index_select(0, batch))).any(1)
+        count = torch.zeros_like(matches.ptr[:-1]).index_add_(0, batch, beyond.to(matches.ptr.dtype))
+        outside += (10 * count > matches.ptr.diff()).nonzero()[:, 0].tolist()
+    if outside:
+        message = (
+            f"the score expects keypoints in pixels of the images, but many of {_count(sorted(set(outside)), matches)} "
+            "lie outside; give the images that the keypoints were found in"
         )
         warnings.warn(message, DomainWarning, stacklevel=3)
 

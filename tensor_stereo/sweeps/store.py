@@ -235,7 +235,10 @@ def read_config_file(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: if the run has another format, or settings that this release does not know.
     """
-    config: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        config: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
     found = config.get("format")
     if found != FORMAT:
         raise ValueError(f"{path.parent} is a run of format {found}, this release reads format {FORMAT}")

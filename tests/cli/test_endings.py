@@ -82,7 +82,12 @@ def test_damaged_pairs_are_told_at_the_end_and_the_others_kept(
     assert "Table 2. FAST" in printed.out
     assert {row["scene"] for row in json.loads((tmp_path / "out" / "summary.json").read_text())} == {"teddy"}
     assert list(json.loads((tmp_path / "out" / "errors.json").read_text())) == ["cones"]
-    (root / "teddy" / "im2.png").write_bytes(b"torn")
+    shutil.copy(release / "cones" / "im6.png", root / "cones")
+    assert ends(["evaluate", str(root), *PLAIN, "--gt-scale", "4", "--out", str(tmp_path / "out")]) == 0
+    assert not (tmp_path / "out" / "errors.json").exists()  # those of an earlier run are none of this one
+    for name in ("cones/im6.png", "teddy/im2.png"):
+        (root / name).write_bytes(b"torn")
+    capsys.readouterr()
     assert ends(["evaluate", str(root), *PLAIN, "--gt-scale", "4"]) == 1
     assert "2 of 2 pairs failed" in capsys.readouterr().err
 
@@ -117,6 +122,14 @@ def test_classify_takes_the_scale_of_a_real_scene_as_index_does(
     assert capsys.readouterr().out == alone
     assert ends([*arguments, *truth, "--gt-scale", "4"]) == 0
     assert capsys.readouterr().out != alone
+
+
+def test_an_evaluation_without_any_known_truth_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(tmp_path / "middlebury" / "2003" / "cones", 0)
+    blank = np.zeros(cv2.imread(str(scene / "im2.png")).shape[:2], np.uint8)
+    cv2.imwrite(str(scene / "disp2.png"), blank)
+    assert ends(["evaluate", str(scene.parent), *PLAIN, "--gt-scale", "4", "--out", str(tmp_path / "out")]) == 1
+    assert "no match of the 1 pairs has known ground truth" in capsys.readouterr().err
 
 
 def test_rates_without_any_known_truth_fail(release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,6 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "m.parquet").write_bytes(b"PAR1")
     (folder / "bad.toml").write_text("[grid]\ndetector = 'orb'\n")
     (folder / "good.toml").write_text("[grid]\n")
+    (folder / "slope.toml").write_text("[grid]\nconsensus.slope = -1.0\n")
     return folder
 
 
@@ -71,6 +72,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("sweep good.toml --manifest none.parquet --out run", "--manifest: there is no file"),
         ("demo --num-pairs 0", "--num-pairs must be at least 1"),
         ("render file/x", "--out: the folder"),
+        ("render out --num-pairs 0", "--num-pairs must be at least 1"),
+        ("classify left.png right.png --figure left.png", "--figure must be another file than LEFT"),
+        ("classify left.png right.png --disparity-gt left.png --gt-scale -1", "(--gt-scale) must be positive"),
+        (
+            "classify left.png right.png --matching.min-disparity-px 5 --matching.max-disparity-px 4",
+            "--matching.min-disparity-px must be at most --matching.max-disparity-px",
+        ),
+        ("classify left.png right.png --restriction adjacency", "--restriction is --verdict now"),
+        ("evaluate . --detectors fast fast", "--detectors must"),
+        ("evaluate . --scenes nothing", "no stereo pairs"),
+        ("sweep good.toml --manifest m.parquet --out run --shard x", "--shard must"),
+        ("sweep good.toml --manifest m.parquet --out run --workers 0", "--workers must"),
+        ("sweep slope.toml --manifest m.parquet --out run", "slope.toml: consensus.slope must"),
     ],
 )
 def test_a_call_that_fails_before_any_work_loads_nothing_heavy(

@@ -196,3 +196,22 @@ def test_missing_entries_and_bad_verdicts_are_named() -> None:
         to_glue_factory(data, indices, torch.ones(len(indices)))
     with pytest.raises(ValueError, match="indices"):
         to_glue_factory(data, indices[:, :2], torch.ones(len(indices), dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("consensus", "tolerance"), [({"slope": 0.3}, None), ({}, None), (None, None), ({"row_tolerance_px": 2.0}, 2.0)]
+)
+def test_a_consensus_in_the_configuration_is_one_of_any_two_views(
+    consensus: dict[str, Any] | None, tolerance: float | None
+) -> None:
+    module = GlueFactoryFilter.from_conf({"score": "consensus", "consensus": consensus}).filter
+    assert isinstance(module, DelaunayFilter)
+    assert module.config.consensus.row_tolerance_px == tolerance
+    if consensus and "slope" in consensus:
+        assert module.config.consensus.slope == consensus["slope"]
+
+
+def test_weights_can_be_trained_by_the_configuration() -> None:
+    module = GlueFactoryFilter.from_conf({"score": "learned", "verdict": "score", "trainable": True})
+    assert any(parameter.requires_grad for parameter in module.parameters())
+    assert not any(p.requires_grad for p in GlueFactoryFilter.from_conf({"trainable": False}).parameters())

@@ -256,3 +256,14 @@ def test_names_are_no_patterns(tmp_path: Path, name: str) -> None:
     filtered(tmp_path, table, ending)
     (tmp_path / f"in{ending}").rename(tmp_path / name)
     assert filter_table(tmp_path / name, tmp_path / f"out{ending}", two_view_filter()).num_matches == 9
+
+
+def test_columns_of_the_user_are_kept(tmp_path: Path) -> None:
+    """A ``score`` or ``probability`` that no earlier verdict wrote is somebody's own."""
+    own = table_of(batch(3)).with_columns(pl.lit(0.5).alias("score"), pl.lit(0.25).alias("probability"))
+    own.write_parquet(tmp_path / "in.parquet")
+    filter_table(
+        tmp_path / "in.parquet", tmp_path / "out.parquet", two_view_filter(verdict="cardinality", score="none")
+    )
+    result = pl.read_parquet(tmp_path / "out.parquet")
+    assert result.select(own.columns).equals(own)

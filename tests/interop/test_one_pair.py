@@ -99,7 +99,7 @@ def test_lafs_and_the_images_of_a_rectified_pair() -> None:
     expected = DelaunayFilter()(matches, images0=pair.image0, images1=pair.image1)
     assert torch.equal(kept, indices[expected.inlier])
     assert torch.equal(distances[:, 0], 1 - expected.score[expected.inlier])
-    with pytest.raises(TypeError, match="images must be None where the score is 'consensus'"):
+    with pytest.raises(TypeError, match="images0 and images1 must be None where the score is 'consensus'"):
         filter_matches(*views, indices, **images)
 
 

@@ -17,9 +17,9 @@ from tensor_stereo.scores.learned_inputs import Quantities, measure_quantities
 from tensor_stereo.types import Adjacency, Matches
 from tests.scores.learned_oracle import infer, random_evidence, random_pairs, see, weights_of
 
-# Quantities differ by some 1e-5 (test_quantities.py). The weights below keep the gain of each layer near one, LayerNorm
-# that of a round: the logits, which are of size one, differ as little. A step that is left out, a wrong sign or another
-# constant changes some of them by far more.
+# Quantities differ by some 1e-5 (test_learned_inputs.py). The weights below keep the gain of each layer near one,
+# LayerNorm that of a round: the logits, which are of size one, differ as little. A step that is left out, a wrong sign
+# or another constant changes some of them by far more.
 ATOL = 1e-4
 
 

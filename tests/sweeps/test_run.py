@@ -164,7 +164,7 @@ def test_the_command_runs_resumes_and_tells_failures_by_its_exit_code(
     assert len(read_results(out)) == 2 * 8
     for arguments, word in (
         ([*command, "--shard", "5"], "shard"),
-        ([*command, "--engine", "ray", "--workers", "0"], "num_workers"),
+        ([*command, "--engine", "ray", "--workers", "0"], "--workers"),
     ):
         with pytest.raises(SystemExit) as stop:
             main(arguments)

@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from tensor_stereo import ops
 from tensor_stereo.configs import COLDEST, HOTTEST, Backend, TemperatureUnit
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.ops import reference_soft
+from tensor_stereo.ops.registration import refuse_tangent
 from tensor_stereo.types import Adjacency, Matches, check_links, check_points, check_tie_tolerance, check_unit
 
 SATURATION = 40.0  # |length / temperature| beyond which an adjacency is constant
@@ -345,8 +345,7 @@ def _bound(tie_tolerance: float) -> float:
 
 def _to_float64(name: str, keypoints: Tensor) -> Tensor:
     check_points(name, keypoints)
-    if not torch.compiler.is_compiling() and forward_ad.unpack_dual(keypoints).tangent is not None:  # type: ignore[no-untyped-call]
-        raise NotImplementedError(f"{name} carries a tangent, but the soft score has no forward mode")
+    refuse_tangent(name, keypoints, "soft")
     return keypoints.to(torch.float64)
 
 

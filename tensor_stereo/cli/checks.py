@@ -23,9 +23,13 @@ def check(command: Any) -> None:
     _CHECKS[type(command)](command)
 
 
+def _check_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
 def _check_demo(command: Demo) -> None:
-    if command.num_pairs < 1:
-        raise ValueError(f"num_pairs must be at least 1, got {command.num_pairs}")
+    _check_least("num_pairs", command.num_pairs, 1)
     if command.out is not None:
         prepare_folder("out", command.out)
 
@@ -86,8 +90,7 @@ def _check_index(command: Index) -> None:
 
 
 def _check_render(command: Render) -> None:
-    if command.num_pairs < 1:
-        raise ValueError(f"num_pairs must be at least 1, got {command.num_pairs}")
+    _check_least("num_pairs", command.num_pairs, 1)
     prepare_folder("out", command.out)
 
 
@@ -109,8 +112,8 @@ def _check_sweep(command: Sweep) -> None:
     parse_shard(command.shard)
     for name, least in (("workers", 1), ("limit", 0)):
         value = getattr(command, name)
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}, got {value}")
+        if value is not None:
+            _check_least(name, value, least)
     check_source("manifest", command.manifest, (".parquet",))
     if not command.dry_run:
         prepare_folder("out", command.out)

@@ -36,7 +36,6 @@ def name_flags(message: str) -> str:
     message = re.sub(r"(?<= as )(source)(?= does)", lambda found: _flag(found[1]), message)
     message = re.sub(r"(?<=another file than )(\w+)", lambda found: _flag(found[1]), message)
     message = re.sub(rf"(?<=must be None beside )({names})\b", lambda found: _flag(found[1]), message)
-    message = message.replace("--gt-scale (--gt-scale)", "--gt-scale")
     return message.replace("the verdict 'score'", "--verdict score").replace(
         "the score 'consensus' with consensus=UNRECTIFIED, or the verdict 'cardinality'",
         "--score consensus --consensus.row-tolerance-px None, or --verdict cardinality",

@@ -22,6 +22,7 @@ from tensor_stereo.ops.segments import (
     segments_of,
     to_points,
     vertices_of,
+    views_of,
 )
 from tensor_stereo.types import check_tie_tolerance
 
@@ -103,9 +104,7 @@ def match_graphs(
     """
     check_tie_tolerance(tie_tolerance)
     kernels = native(backend)
-    views = [to_points("keypoints0", keypoints0, ptr, kernels), to_points("keypoints1", keypoints1, ptr, kernels)]
-    segment = None if group is None else segments_of(ptr, group, len(keypoints0))
-    kept = one_to_one(views, ptr, cost, kernels)
+    views, segment, kept = views_of(keypoints0, keypoints1, ptr, cost, group, kernels)
     (crow0, cols0), (crow1, cols1) = _build(views, ptr, segment, kept, tie_tolerance, kernels)
     return crow0, cols0, crow1, cols1, group_size_of(ptr, segment, kept).to(keypoints0.device)
 

@@ -17,10 +17,8 @@ from tensor_stereo.ops.segments import (
     Float,
     Int,
     group_size_of,
-    one_to_one,
-    segments_of,
-    to_points,
     vertices_of,
+    views_of,
 )
 from tensor_stereo.types import check_tie_tolerance
 
@@ -83,9 +81,7 @@ def soft_match_graphs(
     check_tie_tolerance(tie_tolerance)
     kernels = native(backend)
     edge_lengths, px = reach.tolist()
-    views = [to_points("keypoints0", keypoints0, ptr, kernels), to_points("keypoints1", keypoints1, ptr, kernels)]
-    segment = None if group is None else segments_of(ptr, group, len(keypoints0))
-    kept = one_to_one(views, ptr, cost, kernels)
+    views, segment, kept = views_of(keypoints0, keypoints1, ptr, cost, group, kernels)
     vertex, segment_ptr = vertices_of(ptr, segment, kept)
     if kernels is not None:
         threads = torch.get_num_threads()

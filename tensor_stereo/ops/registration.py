@@ -8,6 +8,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -54,3 +55,11 @@ def operator(
 def refuse_second_derivative(*_: Any) -> None:
     """The backward of an operator that is itself one; without it a second derivative would be zero in silence."""
     raise NotImplementedError("soft counts and dual edge lengths are not differentiable twice")
+
+
+def refuse_tangent(name: str, values: Tensor, score: str) -> None:
+    """Raise for a tensor of forward mode, of which no operator knows the tangent: it would be lost in silence."""
+    if torch.compiler.is_compiling():
+        return
+    if forward_ad.unpack_dual(values).tangent is not None:  # type: ignore[no-untyped-call]
+        raise NotImplementedError(f"{name} carries a tangent, but the {score} score has no forward mode")

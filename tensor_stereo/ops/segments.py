@@ -72,6 +72,20 @@ def check_range(points: Float, describe: Callable[[int], str], kernels: ModuleTy
         raise ValueError(f"{describe(row)} must be finite, {limits}, got {tuple(points[row].tolist())}")
 
 
+def views_of(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    ptr: Tensor,
+    cost: Tensor | None,
+    group: Tensor | None,
+    kernels: ModuleType | None,
+) -> tuple[list[Float], Int | None, Bool]:
+    """Points of both views of putative matches, the segment of every row if there are groups, and the vertices."""
+    views = [to_points("keypoints0", keypoints0, ptr, kernels), to_points("keypoints1", keypoints1, ptr, kernels)]
+    segment = None if group is None else segments_of(ptr, group, len(keypoints0))
+    return views, segment, one_to_one(views, ptr, cost, kernels)
+
+
 def one_to_one(views: list[Float], ptr: Tensor, cost: Tensor | None, kernels: ModuleType | None) -> Bool:
     """(M,) the rows that are vertices, as :func:`tensor_stereo.graphs.build_match_graphs` documents them."""
     values = None if cost is None else cost.detach().to("cpu", torch.float64).contiguous().numpy()

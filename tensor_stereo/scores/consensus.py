@@ -9,13 +9,12 @@ more than their share: of several surfaces one is enough.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from tensor_stereo import ops
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
+from tensor_stereo.ops.registration import refuse_tangent
 from tensor_stereo.scores.calibration import calibrate_consensus
 from tensor_stereo.types import Matches
 
@@ -38,6 +37,7 @@ def consensus_score(matches: Matches, graphs: MatchGraphs, config: FilterConfig 
         ValueError, NotImplementedError: as :func:`consensus_belief`.
 
     Example:
+        >>> import torch
         >>> from tensor_stereo.graphs import build_match_graphs
         >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
         >>> right = left - torch.tensor([5.0, 0.0])
@@ -72,6 +72,7 @@ def consensus_belief(matches: Matches, graphs: MatchGraphs, config: FilterConfig
         NotImplementedError: for tensors that carry a tangent.
 
     Example:
+        >>> import torch
         >>> from tensor_stereo.graphs import build_match_graphs
         >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
         >>> right = left - torch.tensor([5.0, 0.0])
@@ -86,7 +87,10 @@ def consensus_belief(matches: Matches, graphs: MatchGraphs, config: FilterConfig
 
 def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig) -> Tensor:
     """(M,) float64."""
-    _check_tangents(matches)
+    for name in ("keypoints0", "keypoints1", "cost"):
+        values: Tensor | None = getattr(matches, name)
+        if values is not None:
+            refuse_tangent(name, values, "consensus")
     check_match_graphs(matches, graphs)
     settings = config.consensus
     belief: Tensor = ops.consensus_belief(
@@ -110,12 +114,3 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig) -> Ten
         config.backend,
     )
     return belief
-
-
-def _check_tangents(matches: Matches) -> None:
-    for name in ("keypoints0", "keypoints1", "cost"):
-        values: Tensor | None = getattr(matches, name)
-        if values is None or torch.compiler.is_compiling():
-            continue
-        if forward_ad.unpack_dual(values).tangent is not None:  # type: ignore[no-untyped-call]
-            raise NotImplementedError(f"{name} carries a tangent, but the consensus score has no forward mode")

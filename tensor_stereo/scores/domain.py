@@ -77,10 +77,10 @@ def check_images(matches: Matches, images: tuple[Sequence[Tensor], Sequence[Tens
         DomainWarning: if of some pair more than a tenth of the keypoints of a view lie outside.
     """
     outside: list[int] = []
+    batch = ptr_to_batch(matches.ptr)
     for name, view in (("keypoints0", images[0]), ("keypoints1", images[1])):
         points = getattr(matches, name).detach()
         size = points.new_tensor([[image.shape[-1], image.shape[-2]] for image in view]).reshape(-1, 2)
-        batch = ptr_to_batch(matches.ptr)
         beyond = ((points < -1) | (points > size.index_select(0, batch))).any(1)
         count = torch.zeros_like(matches.ptr[:-1]).index_add_(0, batch, beyond.to(matches.ptr.dtype))
         outside += (10 * count > matches.ptr.diff()).nonzero()[:, 0].tolist()

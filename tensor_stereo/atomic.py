@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+_MAX_NAME_BYTES = 255  # of the usual file systems
+_NOT_OFFERED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Write a temporary file in the same folder, which takes the place of ``path`` when the block ends well.
 
-    Contents and name are on disk when this returns. If the block raises, ``path`` is what it was before.
+    Contents and name are on disk when this returns, as far as the file system can tell. If the block raises, ``path``
+    is what it was before.
 
     Args:
         path: file to make or replace; its folder exists.
@@ -31,18 +37,36 @@ def whole_file(path: Path) -> Iterator[Path]:
     ['a.txt']
     """
     part = path.with_name(f".{os.getpid()}.{path.name}")
+    if len(os.fsencode(part.name)) > _MAX_NAME_BYTES:
+        part = path.with_name(f".{os.getpid()}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()}{path.suffix}")
     try:
         yield part
-        _flush(part)
+        with part.open("r+b") as file:
+            flush_file(file.fileno())
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-    _flush(path.parent)  # the rename itself
+    _flush_rename(path.parent)
 
 
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+def flush_file(descriptor: int) -> None:
+    """Wait until what was written to an open file is on disk, where the file system offers that.
+
+    Raises:
+        OSError: if the data cannot be written. A file system without this call, as of some network mounts, is no error.
+    """
     try:
         os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    except OSError as error:
+        if error.errno not in _NOT_OFFERED:
+            raise
+
+
+def _flush_rename(folder: Path) -> None:
+    """Ask for the rename itself to be on disk. It has been done, so that nothing is wrong if this fails."""
+    with suppress(OSError):  # Windows opens no folder, some network mounts flush none
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -6,6 +6,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+TABLES = (".csv", ".parquet")  # endings of tables that are written
+
 
 def check_source(name: str, path: Path, endings: Sequence[str] = ()) -> Path:
     """Raise unless a file can be read and has one of some endings, in any case.
@@ -44,13 +46,26 @@ def check_folder(name: str, path: Path) -> Path:
     return path
 
 
+def has_ending(path: Path, endings: str | Sequence[str]) -> bool:
+    """Whether a path has one of some endings, in any case: the one rule of this package for endings.
+
+    Args:
+        path: Any path.
+        endings: One ending in lower case, or several.
+
+    >>> has_ending(Path("disp0.PFM"), ".pfm"), has_ending(Path("a.png.txt"), (".png", ".jpg"))
+    (True, False)
+    """
+    return path.suffix.casefold() in ((endings,) if isinstance(endings, str) else endings)
+
+
 def check_ending(name: str, path: Path, endings: Sequence[str]) -> None:
     """Raise unless a path has one of some endings, in any case.
 
     Raises:
         ValueError: naming the endings.
     """
-    if endings and path.suffix.casefold() not in endings:
+    if endings and not has_ending(path, endings):
         raise ValueError(f"{name} must end in {' or '.join(endings)}, got {path.name!r}")
 
 

@@ -9,9 +9,9 @@ from typing import Any
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
 from tensor_stereo.datasets.files import check_gt_scale
 from tensor_stereo.interop.formats import check_files
-from tensor_stereo.paths import check_apart, check_folder, check_source, prepare_folder, prepare_target
+from tensor_stereo.paths import TABLES, check_apart, check_folder, check_source, prepare_folder, prepare_target
 
-TABLES, FIGURES, IMAGES = (".csv", ".parquet"), (".png",), ()
+FIGURES = (".png",)
 
 
 def check(command: Any) -> None:

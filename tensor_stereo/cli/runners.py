@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table as RichTable
 
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report
@@ -199,11 +200,11 @@ def _print_tables(tables: Iterable[Any]) -> None:
         if not console.is_terminal:
             print(to_markdown(table))
             continue
-        view = RichTable(title=table.title, title_justify="left")
+        view = RichTable(title=escape(table.title), title_justify="left")
         for k, column in enumerate(table.columns):
             view.add_column(column, justify="left" if k == 0 else "right")
         for row in table.text_rows():
-            view.add_row(*row)
+            view.add_row(*map(escape, row))
         console.print(view)
 
 

@@ -13,6 +13,7 @@ from tensor_stereo.datasets.kitti import kitti_pairs
 from tensor_stereo.datasets.middlebury import middlebury_pairs
 from tensor_stereo.datasets.sceneflow import sceneflow_pairs
 from tensor_stereo.datasets.sintel import sintel_pairs
+from tensor_stereo.paths import has_ending
 
 _EXPECTED = """\
   Middlebury 2001, 2003:     SCENE/im2, im6, disp2 (png, ppm or pgm)
@@ -132,5 +133,5 @@ def _select(pairs: Sequence[PairFiles], scenes: Iterable[str]) -> list[PairFiles
 
 
 def _has_release_scale(pair: PairFiles) -> bool:
-    is_map = pair.disparity_gt is not None and pair.disparity_gt.suffix != ".pfm"
+    is_map = pair.disparity_gt is not None and not has_ending(pair.disparity_gt, ".pfm")
     return is_map and pair.gt_encoding == "scaled" and not pair.dataset.startswith("kitti")

@@ -13,6 +13,8 @@ from tensor_stereo.atomic import whole_file
 from tensor_stereo.datasets.discovery import find_pairs
 from tensor_stereo.datasets.files import GT_ENCODINGS, PairFiles, StrPath, check_gt_scale
 from tensor_stereo.datasets.image_size import image_size
+from tensor_stereo.paths import check_ending, has_ending
+from tensor_stereo.table_files import read_csv, read_parquet, write_table
 
 _PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration")
 SCHEMA = {
@@ -62,7 +64,7 @@ def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -
         raise ValueError("roots must name at least one folder or CSV file")
     found: dict[tuple[Path, Path], PairFiles] = {}
     for root in map(Path, roots):
-        is_list = root.suffix.casefold() == ".csv" and not root.is_dir()
+        is_list = has_ending(root, ".csv") and not root.is_dir()
         for pair in _read_list(root) if is_list else find_pairs(root, gt_scale=gt_scale):
             found.setdefault((pair.image0.resolve(), pair.image1.resolve()), pair)
     pairs = sorted(found.values(), key=lambda pair: (pair.dataset, pair.scene.casefold()))
@@ -93,11 +95,10 @@ def write_manifest(manifest: pl.DataFrame, path: StrPath) -> None:
         OSError: if it cannot be written.
     """
     path = Path(path)
-    if path.suffix != ".parquet":
-        raise ValueError(f"a manifest ends in .parquet, got {path}")
+    check_ending("path", path, (".parquet",))
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as part:
-        manifest.write_parquet(part)
+        write_table(manifest, part)
 
 
 def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]:
@@ -117,10 +118,7 @@ def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no manifest {path}")
-    try:
-        table = pl.read_parquet(path)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise ValueError(f"{path} is no readable Parquet file: {error}") from error
+    table = read_parquet(path)
     for name, dtype in SCHEMA.items():
         if name not in table.columns:
             raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
@@ -159,10 +157,7 @@ def _read_list(path: Path) -> list[PairFiles]:
     """The pairs of a CSV of paths."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no list of pairs {path}")
-    try:
-        table = pl.read_csv(path, infer_schema=False)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise ValueError(f"{path} is no readable CSV file: {error}") from error
+    table = read_csv(path)
     for name in _LISTED:
         if name not in table.columns:
             raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
@@ -189,7 +184,7 @@ def _read_list(path: Path) -> list[PairFiles]:
                 f"{path}, line {row + 2}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}"
             )
         disparity = paths.get("disparity_gt")
-        if disparity is not None and scale is None and encoding == "scaled" and disparity.suffix.casefold() != ".pfm":
+        if disparity is not None and scale is None and encoding == "scaled" and not has_ending(disparity, ".pfm"):
             raise ValueError(f"{path}, line {row + 2}: column 'gt_scale' is empty, but {disparity} is no PFM file")
         dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
         pairs.append(PairFiles(dataset, scene, gt_scale=scale, gt_encoding=encoding, **paths))

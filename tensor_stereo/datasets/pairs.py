@@ -22,6 +22,7 @@ from tensor_stereo.datasets.images import (
     read_sintel_occlusion,
 )
 from tensor_stereo.datasets.pfm import FloatMap, read_pfm
+from tensor_stereo.paths import has_ending
 from tensor_stereo.types import StereoPair
 
 
@@ -105,7 +106,7 @@ def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> Flo
     scale = files.gt_scale if gt_scale is None else gt_scale
     if files.gt_encoding == "sintel":
         return read_sintel_disparity(path)
-    if path.suffix != ".pfm":
+    if not has_ending(path, ".pfm"):
         if scale is None:
             raise missing_scale(files)
         return read_disparity_png(path, scale)

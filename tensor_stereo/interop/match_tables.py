@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,6 @@ import torch
 
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.interop.verdicts import (
-    MAX_ROWS,
     Array,
     FilterSummary,
     Int,
@@ -21,15 +17,12 @@ from tensor_stereo.interop.verdicts import (
     filter_matches,
 )
 from tensor_stereo.ops.segments import check_range
+from tensor_stereo.paths import has_ending
+from tensor_stereo.table_files import read_csv, read_parquet, write_table
 from tensor_stereo.types import Matches, Relation
 
 _POINTS = ("x0", "y0", "x1", "y1")
 _OF_CLASSIFY = ("inlier_adjacency", "inlier_cardinality")  # columns that nothing else writes
-# Polars would inflate such a file, whatever its ending says, and to any size: gzip, zlib, Zstandard.
-_COMPRESSED = (b"\x1f\x8b", b"x\x01", b"x\x9c", b"x\xda", b"\x28\xb5\x2f\xfd")
-# Prints the number of rows that the file claims, then decodes it all.
-_DECODE = "import polars, sys; f = polars.scan_parquet(sys.argv[1], glob=False); n = f.select(polars.len()).collect()"
-_DECODE += "; print(n.item(), flush=True); n.item() > int(sys.argv[2]) or f.collect()"
 
 
 def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
@@ -45,7 +38,7 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
             CSV file or row (from 1) of a Parquet file, and column.
         OSError: if the copy cannot be written.
     """
-    table = _read_csv(source) if source.suffix.casefold() == ".csv" else _read_parquet(source)
+    table = read_csv(source) if has_ending(source, ".csv") else read_parquet(source)
     for name in _POINTS:
         if name not in table.columns:
             raise ValueError(f"{source} has no column {name!r}, it has {table.columns}")
@@ -61,46 +54,8 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
         *([] if verdicts.score is None else [pl.Series("score", verdicts.score)]),
         pl.Series("relation", verdicts.relation).replace_strict(names, return_dtype=pl.String),
     )
-    try:
-        table.write_csv(target) if source.suffix.casefold() == ".csv" else table.write_parquet(target)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:  # where there is no room
-        raise OSError(f"the copy of {source} cannot be written: {error}") from error
+    write_table(table, target)
     return FilterSummary().add(int(pair.max(initial=-1)) + 1, verdicts)
-
-
-def _read_csv(source: Path) -> pl.DataFrame:
-    """All columns as text, so that those which are carried through stay as they are."""
-    with source.open("rb") as file:
-        if file.read(4).startswith(_COMPRESSED):
-            raise ValueError(f"{source} is compressed, not a CSV file; unpack it first")
-    try:
-        header = pl.read_csv(source, glob=False, has_header=False, n_rows=1, infer_schema=False).row(0)
-        table = pl.read_csv(source, glob=False, infer_schema=False)
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        raise ValueError(f"{source} is no readable CSV file: {error}") from error
-    if len(set(header)) < len(header):
-        twice = next(name for name in header if header.count(name) > 1)
-        raise ValueError(f"{source} has the column {twice!r} twice")
-    _check_num_rows(source, len(table))
-    return table
-
-
-def _read_parquet(source: Path) -> pl.DataFrame:
-    # Damaged Parquet can end the process: Polars believes lengths in the data and allocates them. So it is decoded in
-    # a process of its own first.
-    command = [sys.executable, "-P", "-c", _DECODE, str(source), str(MAX_ROWS)]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-    if done.stdout:
-        _check_num_rows(source, int(done.stdout))
-    if done.returncode:
-        reasons = re.findall(r"^\S+(?:Error|Exception): (.+)", done.stderr, re.MULTILINE)
-        raise ValueError(f"{source} is no readable Parquet file: {reasons[-1] if reasons else 'it ends the decoder'}")
-    return pl.read_parquet(source, glob=False)
-
-
-def _check_num_rows(source: Path, num_rows: int) -> None:
-    if num_rows > MAX_ROWS:
-        raise ValueError(f"{source} must have at most {MAX_ROWS} rows, got {num_rows}")
 
 
 def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
@@ -166,4 +121,4 @@ def _place(source: Path, table: pl.DataFrame, row: int) -> str:
 
 def _line(source: Path, row: int) -> str:
     """Where a row of the table stands: the line that an editor shows, below the header, or a number from 1."""
-    return f"{source}, line {row + 2}" if source.suffix.casefold() == ".csv" else f"{source}, row {row + 1}"
+    return f"{source}, line {row + 2}" if has_ending(source, ".csv") else f"{source}, row {row + 1}"

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from tensor_stereo.paths import has_ending
 from tensor_stereo.types import Adjacency, Matches, check_vector
 
 # hues that stay apart for the common colour blindnesses (Okabe & Ito, 2008)
@@ -199,7 +200,7 @@ def write_figure(figure: Figure, path: Path | str) -> None:
         ['empty.png']
     """
     path = Path(path)
-    if path.suffix.lower() == ".png":
+    if has_ending(path, ".png"):
         path.write_bytes(figure_png(figure))
     else:
         figure.savefig(path)

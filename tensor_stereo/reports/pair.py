@@ -18,13 +18,13 @@ from tensor_stereo.datasets.files import check_gt_scale
 from tensor_stereo.evaluation.metrics import Rates, match_rates, matches_against_gt
 from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
-from tensor_stereo.paths import check_apart, prepare_target
+from tensor_stereo.paths import TABLES, check_apart, has_ending, prepare_target
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
+from tensor_stereo.table_files import write_table
 from tensor_stereo.types import Relation, StereoPair
 
 Truth = tuple[Tensor, Tensor]  # correct (M,) and valid (M,), bool
-ENDINGS = (".csv", ".parquet")
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ def classify_files(
     config = config or PipelineConfig()
     left, right = Path(left), Path(right)
     disparity_gt, out, figure = (None if path is None else Path(path) for path in (disparity_gt, out, figure))
-    for name, path, endings in (("out", out, ENDINGS), ("figure", figure, (".png",))):
+    for name, path, endings in (("out", out, TABLES), ("figure", figure, (".png",))):
         if path is not None:
             check_apart(name, path, {"left": left, "right": right, "disparity_gt": disparity_gt})
             prepare_target(name, path, endings)
     check_gt_scale(gt_scale)
-    if gt_scale is not None and (disparity_gt is None or disparity_gt.suffix.casefold() == ".pfm"):
+    if gt_scale is not None and (disparity_gt is None or has_ending(disparity_gt, ".pfm")):
         raise ValueError(f"gt_scale must be None without disparity_gt in a PNG file, got {gt_scale}")
     if disparity_gt is not None and gt_scale is None:
         gt_scale = find_scale(left, disparity_gt)
@@ -97,7 +97,7 @@ def classify_files(
     if out is not None:
         table = match_table(output, config, truth)
         with whole_file(out) as part:
-            table.write_csv(part) if out.suffix.casefold() == ".csv" else table.write_parquet(part)
+            write_table(table, part)
     if figure is not None:
         write_figure(_draw(pair, output, config, truth), figure)
     verdict = output.classification

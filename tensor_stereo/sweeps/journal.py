@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import logging
@@ -13,6 +12,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
+
+from tensor_stereo.atomic import flush_file
+from tensor_stereo.sweeps.locks import lock
 
 LOG = logging.getLogger(__name__)
 
@@ -103,7 +105,7 @@ def append(entry: dict[str, Any], journal: IO[bytes]) -> None:
     try:
         if journal.write(line) != len(line):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), journal.name)
-        os.fsync(journal.fileno())
+        flush_file(journal.fileno())
     except OSError:
         journal.truncate(end)
         raise
@@ -113,7 +115,7 @@ def append(entry: dict[str, Any], journal: IO[bytes]) -> None:
 def run_lock(out: Path) -> Iterator[None]:
     """Wait for, and hold, the run folder for the moment of a change that all shards share."""
     with (out / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        lock(file, wait=True)
         yield
 
 
@@ -136,10 +138,8 @@ def open_journal(out: Path, shard: tuple[int, int]) -> IO[bytes]:
 
 
 def _lock_journal(file: IO[Any], path: Path) -> None:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise RunInUseError(f"another process works on {path.parent} ({path.stem}); wait for it or stop it") from None
+    if not lock(file):
+        raise RunInUseError(f"another process works on {path.parent} ({path.stem}); wait for it or stop it")
 
 
 def is_open_elsewhere(out: Path, shard: str) -> bool:
@@ -148,11 +148,7 @@ def is_open_elsewhere(out: Path, shard: str) -> bool:
     if not path.exists():
         return False
     with path.open("r+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+        return not lock(file)
 
 
 def _is_whole(path: Path, size: int, sha256: str, verify: bool) -> bool:

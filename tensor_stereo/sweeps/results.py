@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import torch
@@ -14,6 +15,7 @@ from tensor_stereo.evaluation.trials import setting_columns
 from tensor_stereo.sweeps.grid import expand_grid
 from tensor_stereo.sweeps.journal import read_journals
 from tensor_stereo.sweeps.store import MATCHES_SCHEMA, METRICS_SCHEMA, errors_table, read_config_file
+from tensor_stereo.table_files import scan_parquet
 from tensor_stereo.types import Matches
 
 
@@ -120,14 +122,11 @@ def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -
     )
 
 
-def _read_parts(run: Path | str, folder: str, schema: dict[str, object]) -> pl.LazyFrame:
+def _read_parts(run: Path | str, folder: str, schema: dict[str, Any]) -> pl.LazyFrame:
     """The finished parts of one kind as one table."""
     run = _check_run(run)
     names = sorted(name for name in read_journals(run).files if name.startswith(f"{folder}/"))
-    if not names:
-        return pl.LazyFrame(schema=schema)  # type: ignore[arg-type]
-    # parts of an earlier release may lack columns
-    return pl.scan_parquet([run / name for name in names], schema=schema, missing_columns="insert")  # type: ignore[arg-type]
+    return scan_parquet([run / name for name in names], schema)  # parts of an earlier release may lack columns
 
 
 def _check_run(run: Path | str) -> Path:

@@ -18,7 +18,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-import polars as pl
 import torch
 
 from tensor_stereo.configs import SweepConfig
@@ -31,6 +30,7 @@ from tensor_stereo.sweeps.plan import Plan, Task, build_plan
 from tensor_stereo.sweeps.ray_engine import RayEngine
 from tensor_stereo.sweeps.store import FORMAT, RunStore, append_environment
 from tensor_stereo.sweeps.units import failed_unit
+from tensor_stereo.table_files import read_parquet
 from tensor_stereo.types import StereoPair
 from tensor_stereo.versions import package_versions
 
@@ -141,7 +141,7 @@ def run_sweep(
     units = plan.shard(*shard)
     if not (out / "config.json").exists():
         check_trials(config)
-    table = pl.read_parquet(manifest)
+    table = read_parquet(Path(manifest))
     record = {
         "format": FORMAT,
         "sweep": asdict(config),

@@ -32,6 +32,7 @@ from tensor_stereo.configs import TrialConfig
 from tensor_stereo.evaluation.dataset import ROW_SCHEMA
 from tensor_stereo.sweeps.journal import append, enter, is_open_elsewhere, open_journal, read_journals, run_lock
 from tensor_stereo.sweeps.units import UnitResult
+from tensor_stereo.table_files import write_table
 
 LOG = logging.getLogger(__name__)
 _MAX_ROWS = 20_000  # that wait for their part, about 80 MB; a hundred matches weigh as much as a row
@@ -192,7 +193,7 @@ def append_environment(out: Path, record: dict[str, Any]) -> None:
 def _write_table(table: pl.DataFrame, path: Path) -> tuple[int, str]:
     """Write Parquet in one step; its size and hash."""
     buffer = io.BytesIO()
-    table.write_parquet(buffer)
+    write_table(table, buffer, ".parquet")
     data = buffer.getvalue()
     with whole_file(path) as part:
         part.write_bytes(data)

@@ -118,7 +118,7 @@ def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
         read_manifest(tmp_path / "empty.parquet")
     with pytest.raises(ValueError, match="no column 'dataset'"):
         read_manifest(tmp_path / "other.parquet")
-    with pytest.raises(ValueError, match=r"ends in \.parquet"):
+    with pytest.raises(ValueError, match=r"must end in \.parquet"):
         write_manifest(pl.DataFrame(schema=SCHEMA), tmp_path / "m.csv")
     with pytest.raises(ValueError, match="at least one"):
         build_manifest([])

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tensor_stereo import Matches, Relation
+from tensor_stereo import Matches, Relation, table_files
 from tensor_stereo.batching import ptr_to_batch, split_matches
 from tensor_stereo.configs import UNRECTIFIED, PipelineConfig
 from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
-from tensor_stereo.interop import match_tables
 from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.match_tables import filter_table
 from tensor_stereo.pipeline import run_pipeline
@@ -243,7 +242,7 @@ def test_damaged_parquet_is_named_and_does_not_end_the_process(tmp_path: Path, p
 
 
 def test_more_rows_than_the_limit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(match_tables, "MAX_ROWS", 5)
+    monkeypatch.setattr(table_files, "MAX_ROWS", 5)
     for ending in ENDINGS:
         with pytest.raises(ValueError, match="must have at most 5 rows, got 9"):
             filtered(tmp_path, table_of(batch(0, [9])), ending)

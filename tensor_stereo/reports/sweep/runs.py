@@ -43,6 +43,8 @@ def load_run(run: Path | str, *, num_overlays: int = 2) -> RunResults:
 
 
 def _overlays(run: Path, results: pl.DataFrame, num_pairs: int) -> list[Overlay]:
+    if num_pairs == 0:
+        return []
     files = {(pair.dataset, pair.scene): pair for pair in read_manifest(run / "manifest.parquet", check_files=False)}
     trials = read_config(run).trials
     drawn = []

@@ -1,0 +1,201 @@
+"""Tables in Parquet and CSV files. Every path is one file by its name, never a pattern. Imports no torch."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import polars as pl
+
+from tensor_stereo.paths import has_ending
+
+MAX_ROWS = 1 << 26  # of a table that comes from elsewhere: 1 GB of coordinates
+_MAX_DECODE_SECONDS = 600
+# Polars would inflate such a file, whatever its ending says, and to any size: gzip, zlib, Zstandard.
+_COMPRESSED = (b"\x1f\x8b", b"x\x01", b"x\x9c", b"x\xda", b"\x28\xb5\x2f\xfd")
+_FAILURES = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError)
+
+
+def read_parquet(path: Path) -> pl.DataFrame:
+    """Read a Parquet file.
+
+    Args:
+        path: The file. Brackets, stars, question marks and a leading ``~`` are part of its name.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is damaged, or has more than ``MAX_ROWS`` rows.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_table(pl.DataFrame({"a": [1, 2]}), Path(folder, "[1]*.parquet"))
+    ...     read_parquet(Path(folder, "[1]*.parquet"))["a"].to_list()
+    [1, 2]
+    """
+    with path.open("rb"):
+        pass  # so that a missing file is told from a damaged one
+    _DECODER.check(path)
+    try:
+        return pl.read_parquet(path.absolute(), glob=False, hive_partitioning=False)
+    except _FAILURES as error:
+        raise ValueError(f"{path} is no readable Parquet file: {error}") from error
+
+
+def scan_parquet(paths: Sequence[Path], schema: dict[str, Any]) -> pl.LazyFrame:
+    """Parquet files of our own as one lazy table; columns of ``schema`` that a file lacks are null."""
+    if not paths:
+        return pl.LazyFrame(schema=schema)
+    files = [path.absolute() for path in paths]
+    return pl.scan_parquet(files, schema=schema, missing_columns="insert", glob=False, hive_partitioning=False)
+
+
+def read_csv(path: Path) -> pl.DataFrame:
+    r"""Read a CSV file as text, so that what is carried through stays as it is.
+
+    Blanks around the names of the columns do not count, nor do blank lines at the end.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is compressed or damaged, a column is there twice, or it has more than ``MAX_ROWS`` rows.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "a.csv").write_text("x, y\n1,2.0\n\n")
+    ...     read_csv(Path(folder, "a.csv")).to_dicts()
+    [{'x': '1', 'y': '2.0'}]
+    """
+    with path.open("rb") as file:
+        if file.read(4).startswith(_COMPRESSED):
+            raise ValueError(f"{path} is compressed, not a CSV file; unpack it first")
+    settings: dict[str, Any] = {"glob": False, "infer_schema": False}
+    try:
+        header = pl.read_csv(path.absolute(), has_header=False, n_rows=1, **settings).row(0)
+        table = pl.read_csv(path.absolute(), **settings)
+    except _FAILURES as error:
+        raise ValueError(f"{path} is no readable CSV file: {error}") from error
+    names = [_unquoted(name or "") for name in header]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"{path} has the column {twice!r} twice")
+    table.columns = names
+    is_blank = pl.all_horizontal(pl.all().fill_null("").str.strip_chars() == "")
+    last = table.select((~is_blank).arg_true().max()).item()
+    table = table.head(0 if last is None else last + 1)
+    if len(table) > MAX_ROWS:
+        raise ValueError(f"{path} must have at most {MAX_ROWS} rows, got {len(table)}")
+    return table
+
+
+def _unquoted(name: str) -> str:
+    """A name without blanks, and without quotes that a blank before them kept."""
+    name = name.strip()
+    return name[1:-1] if len(name) > 1 and name[0] == name[-1] == '"' else name
+
+
+def write_table(table: pl.DataFrame, target: Path | IO[bytes], ending: str = "") -> None:
+    """Write a table as CSV or Parquet.
+
+    Args:
+        table: The rows.
+        target: The file, or an open one.
+        ending: ``.csv`` or ``.parquet``; the one of ``target`` if not given.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    is_csv = ending == ".csv" or (not ending and isinstance(target, Path) and has_ending(target, ".csv"))
+    try:
+        if not isinstance(target, Path):
+            table.write_csv(target) if is_csv else table.write_parquet(target)
+            return
+        with target.open("wb") as file:
+            table.write_csv(file) if is_csv else table.write_parquet(file)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:  # where there is no room
+        raise OSError(f"{target} cannot be written: {error}") from error
+
+
+class _Decoder:
+    """Decodes Parquet files in a process of its own first.
+
+    Damaged Parquet can end the process that decodes it: Polars believes lengths in the data and allocates them.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._owner = 0  # a forked process must not talk to the decoder of its parent
+
+    def check(self, path: Path) -> None:
+        """Raise ValueError unless a file can be decoded and has at most ``MAX_ROWS`` rows."""
+        with self._lock:
+            answer = self._ask(path)
+        if answer is None:
+            raise ValueError(f"{path} is no readable Parquet file: it ends the decoder")
+        if answer.get("num_rows", 0) > MAX_ROWS:
+            raise ValueError(f"{path} must have at most {MAX_ROWS} rows, got {answer['num_rows']}")
+        if "error" in answer:
+            raise ValueError(f"{path} is no readable Parquet file: {' '.join(answer['error'].split())}")
+
+    def _ask(self, path: Path) -> dict[str, Any] | None:
+        """The answer of the process; None if it ended or hung."""
+        process = self._process if self._process and self._owner == os.getpid() else self._start()
+        if process.stdin is None or process.stdout is None:
+            raise RuntimeError("the decoder of Parquet files has no pipes")
+        watch = threading.Timer(_MAX_DECODE_SECONDS, process.kill)
+        watch.start()
+        try:
+            process.stdin.write(json.dumps([str(path.absolute()), MAX_ROWS]) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except OSError:
+            line = ""
+        finally:
+            watch.cancel()
+        if line:
+            return dict(json.loads(line))
+        self.stop()
+        return None
+
+    def _start(self) -> subprocess.Popen[str]:
+        command = [sys.executable, "-P", "-c", _DECODE]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, encoding="utf-8"
+        )
+        self._owner = os.getpid()
+        atexit.register(self.stop)
+        return self._process
+
+    def stop(self) -> None:
+        """End the process, if there is one."""
+        process, self._process = self._process, None
+        atexit.unregister(self.stop)
+        if process is not None:
+            process.kill()
+            process.communicate()
+
+
+# Answers a path with the number of rows that its file claims, then with an error or not.
+_DECODE = """
+import json, sys
+import polars as pl
+for line in sys.stdin:
+    path, max_rows = json.loads(line)
+    answer = {}
+    try:
+        table = pl.scan_parquet(path, glob=False, hive_partitioning=False)
+        answer["num_rows"] = table.select(pl.len()).collect().item()
+        if answer["num_rows"] <= max_rows:
+            table.collect()
+    except BaseException as error:
+        answer["error"] = str(error)
+    print(json.dumps(answer), flush=True)
+"""
+_DECODER = _Decoder()

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 
 from tensor_stereo.interop.verdicts import (
-    MAX_ROWS,
     Array,
     FilterSummary,
     MatchFilter,
@@ -28,6 +27,7 @@ from tensor_stereo.interop.verdicts import (
     filter_each,
     pair_matches,
 )
+from tensor_stereo.table_files import MAX_ROWS
 from tensor_stereo.types import Matches
 
 TABLE = "tensor_stereo_verdicts"
@@ -119,7 +119,7 @@ def _read_pairs(source: Path, database: sqlite3.Connection) -> Iterator[tuple[in
         image1, image2 = pycolmap.pair_id_to_image_pair(pair_id)
         place = f"{place} (images {image1} and {image2})"
         rows = _read_blob(place, database, "matches", pair_id, "<u4")
-        if rows.shape[1] != 2:
+        if len(rows) and rows.shape[1] != 2:
             raise ValueError(f"{place}: table 'matches' must have 2 cols, got {rows.shape[1]}")
         points0, points1 = (_read_blob(place, database, "keypoints", image, "<f4") for image in (image1, image2))
         for view, points in enumerate((points0, points1)):
@@ -129,17 +129,20 @@ def _read_pairs(source: Path, database: sqlite3.Connection) -> Iterator[tuple[in
                 row, given = int(rows[:, view].argmax()), rows[:, view].max()
                 known = f"there are {len(points)} keypoints"
                 raise ValueError(f"{place}: row {row} of the matches names keypoint {given} of view {view}, {known}")
-        rows0, rows1 = rows.astype(np.int64).T
-        yield pair_id, pair_matches(place, points0[:, :2], points1[:, :2], rows0, rows1)
+        rows0, rows1 = rows.astype(np.int64).reshape(-1, 2).T
+        left, right = (points[:, :2] if len(points) else points.reshape(0, 2) for points in (points0, points1))
+        yield pair_id, pair_matches(place, left, right, rows0, rows1)
 
 
 def _read_blob(place: str, database: sqlite3.Connection, table: str, key: int, dtype: str) -> Array:
     """The (rows, cols) array of one row of a table, whose size is checked before its data is read."""
     where = f"FROM {table} WHERE {_KEYS[table]} = ?"
     found = database.execute(f"SELECT rows, cols, ifnull(length(data), 0), typeof(data) {where}", (key,)).fetchone()
-    if found is None:
-        raise ValueError(f"{place}: table {table!r} has no row for {_KEYS[table]} {key}")
+    if found is None:  # an image without features
+        return np.zeros((0, 0), dtype)
     rows, cols, num_bytes, kind = found
+    if num_bytes == 0:
+        rows, cols = rows or 0, cols or 0  # NULL
     if not all(isinstance(value, int) and 0 <= value <= MAX_ROWS for value in (rows, cols)):
         raise ValueError(f"{place}: table {table!r} must have 0..{MAX_ROWS} rows and cols, got {rows!r} and {cols!r}")
     if kind not in ("blob", "null") or num_bytes != rows * cols * 4:
@@ -150,7 +153,8 @@ def _read_blob(place: str, database: sqlite3.Connection, table: str, key: int, d
 
 
 def _write_verdicts(database: sqlite3.Connection, pair_id: int, verdicts: Verdicts) -> None:
-    copied = f"INSERT INTO {TABLE} SELECT pair_id, rows, cols, data, ?, ?, ? FROM matches WHERE pair_id = ?"
+    columns = "pair_id, ifnull(rows, 0), ifnull(cols, 0), data, ?, ?, ?"
+    copied = f"INSERT INTO {TABLE} SELECT {columns} FROM matches WHERE pair_id = ?"
     score = None if verdicts.score is None else verdicts.score.astype("<f4").tobytes()
     blobs = verdicts.inlier.tobytes(), score, verdicts.relation.tobytes()
     database.execute(copied, (*blobs, pair_id))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tensor_stereo.paths import check_apart, check_source, prepare_target
+from tensor_stereo.interop.hdf5 import find_exported, open_file
+from tensor_stereo.interop.result_names import check_score_name
+from tensor_stereo.paths import check_apart, check_ending, check_source, has_ending, prepare_target
 
 # Ending -> first bytes of such a file, and what it is called.
 FORMATS = {
@@ -16,7 +18,7 @@ FORMATS = {
 }
 
 
-def check_files(source: Path, out: Path, keypoints: Path | None) -> str:
+def check_files(source: Path, out: Path, keypoints: Path | None, score_name: str | None = None) -> str:
     """Look at the files of :func:`tensor_stereo.filter_file` before any work, and make the folder of ``out``.
 
     Returns:
@@ -29,12 +31,14 @@ def check_files(source: Path, out: Path, keypoints: Path | None) -> str:
         OSError: if ``out`` cannot be written.
     """
     ending = source.suffix.casefold()
-    if ending not in FORMATS:
-        raise ValueError(f"source must end in {', '.join(FORMATS)}, got {source.name!r}")
-    if out.suffix.casefold() != ending:
+    check_ending("source", source, tuple(FORMATS))
+    check_score_name(score_name)
+    if score_name is not None and ending in (".h5", ".db"):
+        raise ValueError(f"score_name must be None for {ending}, whose results have names of their own")
+    if not has_ending(out, ending):
         raise ValueError(f"out must end in {ending} as source does, got {out.name!r}")
-    if (keypoints is not None) != (ending == ".h5"):
-        raise ValueError(f"keypoints must be given for .h5, and only for it, got {keypoints} for {source.name!r}")
+    if keypoints is not None and ending != ".h5":
+        raise ValueError(f"keypoints must be None but for .h5, got {keypoints} for {source.name!r}")
     for name, path, kind in (("source", source, ending), ("keypoints", keypoints, ".h5")):
         if path is None:
             continue
@@ -44,5 +48,8 @@ def check_files(source: Path, out: Path, keypoints: Path | None) -> str:
         with path.open("rb") as file:
             if file.read(len(first)) != first:
                 raise ValueError(f"{path} is no {called}, whatever its ending says")
+    if ending == ".h5" and keypoints is None:
+        with open_file(source) as file:
+            find_exported(source, file)
     prepare_target("out", out)
     return ending

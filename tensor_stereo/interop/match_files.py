@@ -9,9 +9,9 @@ from tensor_stereo.atomic import whole_file
 from tensor_stereo.configs import FileFilterConfig, FilterConfig
 from tensor_stereo.interop.colmap import filter_colmap
 from tensor_stereo.interop.formats import check_files
-from tensor_stereo.interop.hloc import filter_hloc
+from tensor_stereo.interop.hdf5_matches import filter_hdf5
 from tensor_stereo.interop.match_tables import filter_table
-from tensor_stereo.interop.npz import filter_npz, holds_indices
+from tensor_stereo.interop.npz import filter_npz, is_rectified
 from tensor_stereo.interop.verdicts import FilterSummary
 from tensor_stereo.modules import DelaunayFilter
 
@@ -21,6 +21,7 @@ def filter_file(
     out: Path | str,
     *,
     keypoints: Path | str | None = None,
+    score_name: str | None = None,
     config: FilterConfig | None = None,
 ) -> FilterSummary:
     r"""Decide which matches of a file are right, and write the file again with verdict and score.
@@ -28,17 +29,18 @@ def filter_file(
     The format is that of the ending, and the same for both files:
 
     ============  ==================================================================================================
-    ``.npz``      arrays of rows, or of LightGlue and glue-factory: :func:`~tensor_stereo.interop.npz.filter_npz`
+    ``.npz``      arrays of rows or indices, of this library and others: :func:`~tensor_stereo.interop.npz.filter_npz`
     ``.csv``      a row per match: :func:`~tensor_stereo.interop.match_tables.filter_table`
     ``.parquet``  the same
-    ``.h5``       matches of hloc, with ``keypoints``: :func:`~tensor_stereo.interop.hloc.filter_hloc`
+    ``.h5``       hloc, DISK, glue-factory: :func:`~tensor_stereo.interop.hdf5_matches.filter_hdf5`
     ``.db``       database of COLMAP: :func:`~tensor_stereo.interop.colmap.filter_colmap`
     ============  ==================================================================================================
 
     Verdict and score are those of :class:`~tensor_stereo.DelaunayFilter` on all pairs as one batch, in blocks of
     bounded size, with coordinates in float64. Files of rows are taken to come from rectified pairs, and a match is kept
-    if its probability is at least .5. Files of hloc, COLMAP and LightGlue (``.npz`` with ``matches0``) are not: there
-    the default verdict is ``cardinality``, with a ``consensus`` score for any two views. Pairs with few or no matches
+    if its probability is at least .5. The forms of other tools (``.h5``, ``.db``, and ``.npz`` with index arrays or of
+    detector-free matchers) are not: there the default verdict is ``cardinality``, with a ``consensus`` score for any
+    two views. Pairs with few or no matches
     are UNTESTED. Files are data only: nothing in them is run, unpickled or taken for a path, and no
     size in them is believed before it is checked.
 
@@ -46,7 +48,9 @@ def filter_file(
         source: file of putative matches. It is not changed.
         out: file to write, with the ending of ``source``. It appears whole or not at all; one that exists is replaced,
             and its folder is made.
-        keypoints: hloc's file of features; for ``.h5`` only.
+        keypoints: The file of keypoints that belongs to an ``.h5`` file of hloc or DISK; None for all others.
+        score_name: Name of the column or array of the score; None: ``score``, or ``filter_score`` beside a ``score`` of
+            the user's. For ``.npz``, ``.csv`` and ``.parquet`` only.
         config: Settings of verdict and score; None, or ``verdict=None`` of a
             :class:`~tensor_stereo.configs.FileFilterConfig`, leaves the verdict to the form of the file. In files of
             any two views, ``consensus`` looks at no row offset unless its settings are given.
@@ -72,18 +76,18 @@ def filter_file(
     """
     source, out = Path(source), Path(out)
     keypoints = None if keypoints is None else Path(keypoints)
-    ending = check_files(source, out, keypoints)
+    ending = check_files(source, out, keypoints, score_name)
     settings = {} if config is None else {f.name: getattr(config, f.name) for f in fields(FilterConfig)}
-    of_any_views = ending in (".h5", ".db") or (ending == ".npz" and holds_indices(source))
+    of_any_views = ending in (".h5", ".db") or (ending == ".npz" and not is_rectified(source))
     config = FileFilterConfig(**settings).resolve(rectified=not of_any_views)
     if config.resolved_score == "none":
         config = replace(config, score="none")  # nobody asks for a gradient here
     run = DelaunayFilter(config)
     with whole_file(out) as target:
         if ending == ".npz":
-            return filter_npz(source, target, run)
+            return filter_npz(source, target, run, score_name=score_name)
         if ending == ".db":
             return filter_colmap(source, target, run)
-        if keypoints is not None:
-            return filter_hloc(source, target, run, keypoints)
-        return filter_table(source, target, run)
+        if ending == ".h5":
+            return filter_hdf5(source, target, run, keypoints)
+        return filter_table(source, target, run, score_name=score_name)

@@ -9,12 +9,14 @@ import polars as pl
 import torch
 
 from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.interop.result_names import name_results, result_in
 from tensor_stereo.interop.verdicts import (
     Array,
     FilterSummary,
     Int,
     MatchFilter,
     filter_matches,
+    is_score,
 )
 from tensor_stereo.ops.segments import check_range
 from tensor_stereo.paths import has_ending
@@ -22,15 +24,18 @@ from tensor_stereo.table_files import read_csv, read_parquet, write_table
 from tensor_stereo.types import Matches, Relation
 
 _POINTS = ("x0", "y0", "x1", "y1")
+_RELATIONS = {relation.value: relation.name.lower() for relation in Relation}
 _OF_CLASSIFY = ("inlier_adjacency", "inlier_cardinality")  # columns that nothing else writes
 
 
-def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
+def filter_table(source: Path, target: Path, run: MatchFilter, *, score_name: str | None = None) -> FilterSummary:
     """Copy a table and add ``inlier``, ``score`` if the settings name one, and ``relation``, by name in lower case.
 
     Columns: ``x0, y0, x1, y1`` in px, and optionally ``pair``, a string or an integer that names the pair of a row,
     whose rows need not be adjacent; ``cost``, lower is better; ``group``, integer. All rows and columns are kept, in
-    order; columns with the names of the results are replaced. What ``tensor-stereo classify --out`` writes is such a
+    order. Results of an earlier filter are replaced; where a column of the user's has the name of a result, the result
+    gets another one by :func:`~tensor_stereo.interop.result_names.name_results`.
+    What ``tensor-stereo classify --out`` writes is such a
     table of one pair.
 
     Raises:
@@ -46,16 +51,36 @@ def filter_table(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     order = np.argsort(pair, kind="stable")  # whole pairs, their rows in the order of the file
     verdicts = filter_matches(_to_matches(source, table, pair, order), run)
     verdicts = verdicts.take(np.argsort(order, kind="stable"))
-    names = {relation.value: relation.name.lower() for relation in Relation}
     if set(_OF_CLASSIFY) <= set(table.columns):  # its verdicts are replaced by those of this filter
         table = table.drop("probability", "score", "inlier_score", *_OF_CLASSIFY, strict=False)
+    ours = _ours(table, score_name)
+    names = name_results(str(source), table.columns, ours=ours, score_name=score_name)
+    if verdicts.score is None:
+        table = table.drop(ours - {names.inlier, names.relation})
     table = table.with_columns(
-        pl.Series("inlier", verdicts.inlier),
-        *([] if verdicts.score is None else [pl.Series("score", verdicts.score)]),
-        pl.Series("relation", verdicts.relation).replace_strict(names, return_dtype=pl.String),
+        pl.Series(names.inlier, verdicts.inlier),
+        *([] if verdicts.score is None else [pl.Series(names.score, verdicts.score)]),
+        pl.Series(names.relation, verdicts.relation).replace_strict(_RELATIONS, return_dtype=pl.String),
     )
     write_table(table, target)
     return FilterSummary().add(int(pair.max(initial=-1)) + 1, verdicts)
+
+
+def _ours(table: pl.DataFrame, score_name: str | None) -> set[str]:
+    """The columns that an earlier filter wrote."""
+    names = [result_in(table.columns, name) for name in ("inlier", "relation")]
+    found = {name for name in names if name is not None}
+    if len(found) < len(names):
+        return set()
+    inlier, relation = (table[name].cast(pl.String, strict=False) for name in names)  # type: ignore[index]
+    if not relation.is_in(list(_RELATIONS.values())).all() or not inlier.is_in(["true", "false"]).all():
+        return set()
+    untested = (relation == "untested").to_numpy()
+    for name in ("score", score_name):
+        if name in table.columns:
+            values = table[name].cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
+            found |= {name} if name and is_score(values, untested) else set()
+    return found
 
 
 def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
@@ -103,9 +128,14 @@ def _numbers(source: Path, table: pl.DataFrame, name: str, dtype: type[pl.DataTy
     column = table[name]
     noun = "an integer" if dtype == pl.Int64 else "a number"
     if column.dtype == pl.String:
-        values = column.str.strip_chars().cast(dtype, strict=False)
+        text = column.str.strip_chars()
+        values = text.cast(dtype, strict=False)
+        if dtype == pl.Int64:  # other tools write 1.0
+            values = values.fill_null(_whole(text.cast(pl.Float64, strict=False)))
     elif column.dtype.is_integer() or (column.dtype.is_numeric() and dtype == pl.Float64):
         values = column.cast(dtype, strict=False)
+    elif column.dtype.is_float():
+        values = _whole(column.cast(pl.Float64))
     else:
         raise ValueError(f"{source}: column {name!r} must hold {noun} per row, got {column.dtype}")
     if values.has_nulls():
@@ -113,6 +143,12 @@ def _numbers(source: Path, table: pl.DataFrame, name: str, dtype: type[pl.DataTy
         place = f"{_place(source, table, row)}: column {name!r}"
         raise ValueError(f"{place} must be {noun}, got {column[row]!r}" if column[row] else f"{place} is empty")
     return values.to_numpy()
+
+
+def _whole(values: pl.Series) -> pl.Series:
+    """Numbers that are integers as such, null elsewhere."""
+    is_whole = (values == values.round()) & (values.abs() < 2**53)
+    return values.set(~is_whole.fill_null(value=False), None).cast(pl.Int64, strict=False)
 
 
 def _place(source: Path, table: pl.DataFrame, row: int) -> str:

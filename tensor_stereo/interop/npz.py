@@ -1,4 +1,4 @@
-"""NumPy archives of matches: rows of both views, or keypoints with the index of each one's partner."""
+"""NumPy archives of matches: read without trust, and written again with the verdicts."""
 
 from __future__ import annotations
 
@@ -7,52 +7,28 @@ import math
 import shutil
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from tensor_stereo.interop.verdicts import (
-    MAX_ROWS,
-    Array,
-    FilterSummary,
-    MatchFilter,
-    Verdicts,
-    filter_matches,
-    pick_matches,
-)
-from tensor_stereo.ops.segments import check_range
-from tensor_stereo.types import Matches
+from tensor_stereo.interop.npz_forms import Header, find_form, form_matches
+from tensor_stereo.interop.result_names import name_results, result_in
+from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, filter_matches, is_score
+from tensor_stereo.table_files import MAX_ROWS
+from tensor_stereo.types import Relation
 
 _HEADER_BYTES = 10_000  # what NumPy itself accepts of a header, by default
 _MAX_RATIO = 1032  # of deflate, by its format
-# Name of an array -> kinds of its dtype and number of its axes.
-_NUMBERS = "fiu"
-_INTEGERS = "iu"
-_RAGGED = {
-    "keypoints0": (_NUMBERS, 2),
-    "keypoints1": (_NUMBERS, 2),
-    "ptr": (_INTEGERS, 1),
-    "cost": (_NUMBERS, 1),
-    "group": (_INTEGERS, 1),
-}
-_INDEXED = {
-    "keypoints0": (_NUMBERS, 2),
-    "keypoints1": (_NUMBERS, 2),
-    "matches0": (_INTEGERS, 1),
-    "matching_scores0": (_NUMBERS, 1),
-}
 
 
-def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
+def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str | None = None) -> FilterSummary:
     """Copy an archive and add ``inlier`` bool, ``relation`` int8 and, if the settings name one, ``score`` float64.
 
-    Two forms are read. Rows, the form of :class:`~tensor_stereo.Matches`: ``keypoints0`` and ``keypoints1`` (M, 2), and
-    optionally ``ptr`` (B + 1,), ``cost`` (M,) and ``group`` (M,); the results are (M,). One pair, as LightGlue and
-    glue-factory have it: ``keypoints0`` (N0, 2), ``keypoints1`` (N1, 2), ``matches0`` (N0,) with -1 and -2, and
-    optionally ``matching_scores0`` (N0,), higher is better; the results are (N0,), and False, 0 and UNTESTED where
-    there is no match. All other arrays are carried through as they are.
+    The forms that are read are those of :mod:`tensor_stereo.interop.npz_forms`. The results have a value for each row
+    of the matches, or for each entry of the index array, where they are False, 0 and UNTESTED if there is no match. All
+    other arrays are carried through as they are. Names of results that the archive uses for something else are chosen
+    as in :func:`~tensor_stereo.interop.result_names.name_results`.
 
     Nothing is unpickled, and no array is allocated before the shape and dtype of its header fit the member's size.
 
@@ -62,39 +38,59 @@ def filter_npz(source: Path, target: Path, run: MatchFilter) -> FilterSummary:
     try:
         with zipfile.ZipFile(source) as archive:
             members = _check_members(source, archive)
-            arrays = {
-                name: _read_array(source, archive, members[name], *form)
-                for name, form in _form(source, members).items()
-                if name in members
-            }
-            verdicts, num_pairs = _filter_arrays(source, arrays, run)
-            kind = members["keypoints0"].compress_type
+            form = find_form(str(source), {name: header for name, (_, header) in members.items()})
+
+            def read(name: str) -> Array:
+                return _read_array(source, archive, members[name][0])
+
+            arrays = {name: read(name) for name in form.arrays}
+            ours = _ours(members, read, score_name)
+            names = name_results(str(source), members, ours=ours, score_name=score_name)
+            read_pairs = form_matches(str(source), form, arrays)
+            verdicts = filter_matches(read_pairs.matches, run)
+            kind = members[form.points0][0].compress_type
+            results = dict(zip(names, read_pairs.lay_out(verdicts), strict=True))
             with zipfile.ZipFile(target, "w", kind) as result:
-                for name, info in members.items():
-                    if name not in Verdicts._fields or (name == "score" and verdicts.score is None):
+                for name, (info, _) in members.items():
+                    if results.get(name) is None and name not in ours:
                         _copy_member(archive, info, result)
-                for name, values in _to_rows(arrays, verdicts)._asdict().items():
-                    if values is None:
-                        continue
-                    with result.open(f"{name}.npy", "w", force_zip64=True) as file:
-                        np.lib.format.write_array(file, values, allow_pickle=False)
+                for name, values in results.items():
+                    if values is not None:
+                        with result.open(f"{name}.npy", "w", force_zip64=True) as file:
+                            np.lib.format.write_array(file, values, allow_pickle=False)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
         raise ValueError(f"{source} is no readable archive: {error}") from error
-    return FilterSummary().add(num_pairs, verdicts)
+    return FilterSummary().add(read_pairs.matches.num_pairs, verdicts)
 
 
-def holds_indices(source: Path) -> bool:
-    """Whether an archive names partners by ``matches0``, as LightGlue and glue-factory do; False if it is damaged."""
+def is_rectified(source: Path) -> bool:
+    """Whether the form of an archive promises rectified pairs; True if it is damaged, which is found later."""
     try:
         with zipfile.ZipFile(source) as archive:
-            return "matches0.npy" in archive.namelist()
-    except (zipfile.BadZipFile, EOFError, NotImplementedError):
-        return False
+            members = _check_members(source, archive)
+        return find_form(str(source), {name: header for name, (_, header) in members.items()}).is_rectified
+    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError):
+        return True
 
 
-def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+def _ours(
+    members: Mapping[str, tuple[zipfile.ZipInfo, Header]], read: Callable[[str], Array], score_name: str | None
+) -> set[str]:
+    """The results in an archive that an earlier filter wrote."""
+    inlier, relation = (result_in(members, name) for name in ("inlier", "relation"))
+    if inlier is None or relation is None:
+        return set()
+    headers = {name: members[name][1] for name in (inlier, relation)}
+    if headers[inlier].dtype != bool or headers[relation] != (headers[inlier].shape, np.dtype(np.int8)):
+        return set()
+    untested = read(relation) == Relation.UNTESTED
+    scores = [name for name in ("score", score_name) if name in members]
+    return {*headers, *(name for name in scores if name and is_score(read(name), untested))}
+
+
+def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, tuple[zipfile.ZipInfo, Header]]:
     """The members by name of their array; raises unless all hold plain arrays of the size that they claim."""
-    members: dict[str, zipfile.ZipInfo] = {}
+    members: dict[str, tuple[zipfile.ZipInfo, Header]] = {}
     num_bytes_left = source.stat().st_size  # members must not overlap
     for info in archive.infolist():
         name = info.filename.removesuffix(".npy")
@@ -102,7 +98,6 @@ def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
             raise ValueError(f"{source}: every member must be named like 'keypoints0.npy', got {info.filename!r}")
         if name in members:
             raise ValueError(f"{source} holds the array {name!r} twice")
-        members[name] = info
         place = f"{source}, array {name!r}"
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
             raise ValueError(f"{place} must be stored or deflated without a password, as NumPy writes it")
@@ -116,6 +111,7 @@ def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
         if header_bytes + num_bytes != info.file_size:
             held = f"holds {info.file_size - header_bytes}"
             raise ValueError(f"{place} claims {num_bytes} bytes as {shape} {dtype}, but the member {held}")
+        members[name] = info, Header(shape, dtype)
     return members
 
 
@@ -140,77 +136,15 @@ def _read_header(
     return shape, dtype, head.tell()
 
 
-def _form(source: Path, members: Mapping[str, object]) -> dict[str, tuple[str, int]]:
-    """The arrays to read, from the names that are there."""
-    is_indexed = "matches0" in members
-    for name in ("keypoints0", "keypoints1"):
-        if name not in members:
-            raise ValueError(f"{source} must hold the array {name!r}, it has {sorted(members)}")
-    if is_indexed:
-        for name in ("ptr", "cost", "group"):
-            if name in members:
-                raise ValueError(f"{source} holds 'matches0' of one pair, so that {name!r} has no meaning")
-    return _INDEXED if is_indexed else _RAGGED
-
-
-def _read_array(source: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, kinds: str, ndim: int) -> Array:
+def _read_array(source: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Array:
     """One array whose header and size were checked."""
     place = f"{source}, array {info.filename.removesuffix('.npy')!r}"
-    shape, dtype, _ = _read_header(place, archive, info)
-    if dtype.kind not in kinds:
-        raise ValueError(f"{place} must hold {'integers' if kinds == _INTEGERS else 'numbers'}, got {dtype}")
-    if len(shape) != ndim or (ndim == 2 and shape[1] != 2):
-        raise ValueError(f"{place} must have shape {'(N, 2)' if ndim == 2 else '(N,)'}, got {shape}")
-    if shape[0] > MAX_ROWS:
-        raise ValueError(f"{place} must have at most {MAX_ROWS} rows, got {shape[0]}")
+    shape, _, _ = _read_header(place, archive, info)
+    if max(shape, default=0) > MAX_ROWS:
+        raise ValueError(f"{place} must have at most {MAX_ROWS} rows, got {max(shape)}")
     with archive.open(info) as member:
         array: Array = np.lib.format.read_array(member, allow_pickle=False)
     return array
-
-
-def _filter_arrays(source: Path, arrays: Mapping[str, Array], run: MatchFilter) -> tuple[Verdicts, int]:
-    """Verdicts on the matches, and the number of pairs."""
-    if "matches0" in arrays:
-        scores = arrays.get("matching_scores0")
-        if scores is not None and scores.shape != arrays["matches0"].shape:
-            expected, given = arrays["matches0"].shape, scores.shape
-            raise ValueError(f"{source}, array 'matching_scores0' must have shape {expected}, got {given}")
-        views = arrays["keypoints0"], arrays["keypoints1"]
-        matches = pick_matches(str(source), *views, arrays["matches0"], scores)
-    else:
-        matches = _ragged_matches(source, arrays)
-    return filter_matches(matches, run), matches.num_pairs
-
-
-def _ragged_matches(source: Path, arrays: Mapping[str, Array]) -> Matches:
-    """The matches of the form with rows."""
-    num_matches = len(arrays["keypoints0"])
-    ptr, cost, group = (arrays.get(name) for name in ("ptr", "cost", "group"))
-    ptr = np.array([0, num_matches]) if ptr is None else ptr.astype(np.int64)
-    try:
-        matches = Matches(
-            torch.from_numpy(arrays["keypoints0"].astype(np.float64)),
-            torch.from_numpy(arrays["keypoints1"].astype(np.float64)),
-            torch.from_numpy(ptr),
-            None if cost is None else torch.from_numpy(cost.astype(np.float64)),
-            None if group is None else torch.from_numpy(group.astype(np.int64)),
-        )
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
-
-    def describe(name: str, row: int) -> str:
-        return f"{source}: {name}, row {row} (pair {np.searchsorted(ptr, row, side='right') - 1}),"
-
-    check_range(matches.keypoints0.numpy(), lambda row: describe("keypoints0", row))
-    check_range(matches.keypoints1.numpy(), lambda row: describe("keypoints1", row))
-    if matches.cost is not None and bool(matches.cost.isnan().any()):
-        raise ValueError(f"{describe('cost', int(matches.cost.isnan().int().argmax()))} must not be NaN")
-    return matches
-
-
-def _to_rows(arrays: Mapping[str, Array], verdicts: Verdicts) -> Verdicts:
-    """The verdicts in the layout of the arrays."""
-    return verdicts.spread(arrays["matches0"] >= 0) if "matches0" in arrays else verdicts
 
 
 def _copy_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, result: zipfile.ZipFile) -> None:

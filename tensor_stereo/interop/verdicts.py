@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -24,7 +24,6 @@ Key = TypeVar("Key")
 MatchFilter: TypeAlias = Callable[[Matches], FilterOutput]
 
 BLOCK_MATCHES = 1 << 17  # about 200 MB while the filter runs
-MAX_ROWS = 1 << 26  # matches of a table, keypoints of an image: 1 GB of coordinates a view
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,9 @@ class FilterSummary:
             self.num_agreeing + int(((verdicts.relation > 0) & (verdicts.relation < Relation.CONFLICT)).sum()),
         )
 
+    def __add__(self, other: FilterSummary) -> FilterSummary:
+        return FilterSummary(*(mine + more for mine, more in zip(astuple(self), astuple(other), strict=True)))
+
 
 class Verdicts(NamedTuple):
     """Verdict on every match."""
@@ -60,21 +62,36 @@ class Verdicts(NamedTuple):
     relation: Int8  # (M,) values of Relation
 
     def spread(self, mask: Bool) -> Verdicts:
-        """The same at the M True places of ``mask`` (N,); no inlier, 0 and UNTESTED elsewhere."""
+        """The same at the M True places of ``mask``, in its shape; no inlier, 0 and UNTESTED elsewhere."""
         return self._map(lambda values: _spread(values, mask))
 
     def take(self, rows: Int) -> Verdicts:
         """The verdicts of ``rows``, in their order."""
         return self._map(lambda values: values[rows])
 
+    def reshape(self, shape: tuple[int, ...]) -> Verdicts:
+        """The same in another shape."""
+        return self._map(lambda values: values.reshape(shape))
+
     def _map(self, change: Callable[[Array], Array]) -> Verdicts:
         return Verdicts(*(None if values is None else change(values) for values in self))  # type: ignore[arg-type]
 
 
 def _spread(values: Array, mask: Bool) -> Array:
-    wide = np.zeros(len(mask), values.dtype)
+    wide = np.zeros(mask.shape, values.dtype)
     wide[mask] = values
     return wide
+
+
+def is_score(values: Array, untested: Bool) -> bool:
+    """Whether values can be a score that a filter wrote: numbers in [0, 1], and 0 for what was untested.
+
+    >>> is_score(np.array([0.0, 0.5]), np.array([True, False])), is_score(np.array([7, 8]), np.array([True, False]))
+    (True, False)
+    """
+    if values.shape != untested.shape or values.dtype.kind != "f":
+        return False
+    return bool(((values >= 0) & (values <= 1)).all() and not values[untested].any())
 
 
 def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
@@ -133,41 +150,6 @@ def _filter_block(block: list[tuple[Key, Matches]], run: MatchFilter) -> Iterato
     columns = ([None] * len(block) if values is None else np.split(values, cuts) for values in verdicts)
     for (key, _), *values in zip(block, *columns, strict=True):
         yield key, Verdicts(*values)
-
-
-def pick_matches(place: str, keypoints0: Array, keypoints1: Array, matches0: Array, scores0: Array | None) -> Matches:
-    """One pair's matches from the partner of each keypoint, in the order of view 0.
-
-    Args:
-        place: file and pair, for errors.
-        keypoints0: (N0, 2), (x, y) in px.
-        keypoints1: (N1, 2).
-        matches0: at most (N0,) integers: a row of ``keypoints1``, -1 for none, -2 for "ignore".
-        scores0: one score per row of ``matches0``, higher is better; the cost is 1 - score.
-
-    Raises:
-        ValueError: if a partner does not exist, a matched keypoint is not finite or a score is NaN.
-
-    >>> points = np.eye(2)
-    >>> pick_matches("m.npz", points, points, np.array([-1, 0]), None).keypoints1
-    tensor([[1., 0.]], dtype=torch.float64)
-    """
-    if len(matches0) > len(keypoints0):
-        raise ValueError(f"{place}: matches0 has {len(matches0)} rows, but there are {len(keypoints0)} keypoints0")
-    partner = matches0.astype(np.int64)
-    wrong = (partner < -2) | (partner >= len(keypoints1))
-    if wrong.any():
-        row = int(wrong.argmax())
-        known = f"one of {len(keypoints1)} keypoints1"
-        raise ValueError(f"{place}: matches0 must be -1, -2 or {known}, got {partner[row]} in row {row}")
-    rows0 = np.flatnonzero(partner >= 0)
-    rows1 = partner[rows0]
-    cost = None
-    if scores0 is not None:
-        cost = 1 - scores0[rows0].astype(np.float64)
-        if np.isnan(cost).any():
-            raise ValueError(f"{place}: matching_scores0 must not be NaN, got NaN in row {rows0[np.isnan(cost)][0]}")
-    return pair_matches(place, keypoints0, keypoints1, rows0, rows1, cost)
 
 
 def pair_matches(

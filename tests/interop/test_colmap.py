@@ -169,14 +169,17 @@ def test_filtering_twice_replaces_the_verdicts(pycolmap: Any, tmp_path: Path) ->
         ("UPDATE matches SET rows = 1 WHERE rows = 0", "'matches' claims 1 x 2 values of 4 bytes, its data has 0"),
         (
             "DELETE FROM keypoints WHERE image_id = 3",
-            r"\(images 1 and 3\): table 'keypoints' has no row for image_id 3",
+            r"\(images 2 and 3\): row \d+ of the matches names keypoint 49 of view 1, there are 0 keypoints",
         ),
         (
             "UPDATE keypoints SET rows = 40, data = substr(data, 1, 320) WHERE image_id = 1",
             "names keypoint 4. of view 0",
         ),
         ("UPDATE matches SET pair_id = -5 WHERE rows = 45", "pair_id -5 must be a number that COLMAP gives"),
-        ("UPDATE matches SET pair_id = 5 WHERE rows = 45", r"pair_id 5 \(images 0 and 5\)"),
+        (
+            "UPDATE matches SET pair_id = 5 WHERE rows = 45",
+            r"pair_id 5 \(images 0 and 5\): row .* of view 0, there are 0 keypoints",
+        ),
     ],
 )
 def test_wrong_rows_are_named_by_table_and_pair(pycolmap: Any, tmp_path: Path, change: str, message: str) -> None:
@@ -258,3 +261,66 @@ def test_a_full_disk_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(colmap, "_filter_copy", fill)
     with pytest.raises(OSError, match=r"the copy of .*in\.db cannot be written: database or disk is full"):
         filter_colmap(tmp_path / "in.db", tmp_path / "out.db", two_view_filter())
+
+
+EMPTY_KEYPOINTS = (
+    "DELETE FROM keypoints WHERE image_id = 3",
+    "UPDATE keypoints SET rows = 0, cols = 0, data = NULL WHERE image_id = 3",
+    "UPDATE keypoints SET rows = 0, cols = 4, data = x'' WHERE image_id = 3",
+)
+EMPTY_MATCHES = (
+    "UPDATE matches SET rows = 0, cols = 2, data = NULL WHERE pair_id % 2147483647 = 3",
+    "UPDATE matches SET rows = 0, cols = 0, data = x'' WHERE pair_id % 2147483647 = 3",
+    "DELETE FROM matches WHERE pair_id % 2147483647 = 3",
+)
+OTHER_TABLES = (
+    "SELECT 1",
+    "DELETE FROM images WHERE image_id = 3",
+    "DELETE FROM images",
+    "DROP TABLE images",
+    "DELETE FROM two_view_geometries",
+    "UPDATE two_view_geometries SET rows = 0, cols = 0, data = NULL",
+    "DROP TABLE two_view_geometries",
+)
+
+
+@pytest.mark.parametrize("keypoints_are", EMPTY_KEYPOINTS)
+@pytest.mark.parametrize("matches_are", EMPTY_MATCHES)
+@pytest.mark.parametrize("other", OTHER_TABLES)
+def test_an_image_without_features_makes_empty_pairs(
+    pycolmap: Any, tmp_path: Path, keypoints_are: str, matches_are: str, other: str
+) -> None:
+    source, target = tmp_path / "in.db", tmp_path / "out.db"
+    write_database(pycolmap, source, 0)
+    expected = filter_colmap(source, target, two_view_filter())
+    left = query(target, "SELECT rows, data FROM matches WHERE pair_id = 2147483649")
+    execute(source, "PRAGMA foreign_keys = OFF")
+    for change in (keypoints_are, matches_are, other):
+        execute(source, change)
+    summary = filter_colmap(source, target, two_view_filter())
+    assert summary.num_pairs == (1 if matches_are.startswith("DELETE") else expected.num_pairs)
+    assert summary.num_matches == 45
+    assert query(target, "SELECT rows, data FROM matches WHERE pair_id = 2147483649") == left
+    empty = query(target, f"SELECT rows, ifnull(length(inlier), 0) FROM {TABLE} WHERE pair_id % 2147483647 = 3")
+    assert set(empty) <= {(0, 0)}
+
+
+@pytest.mark.parametrize("change", ["rows = NULL", "cols = NULL", "rows = NULL, cols = NULL", "data = NULL"])
+def test_null_is_empty_where_there_is_no_data_and_an_error_where_there_is(tmp_path: Path, change: str) -> None:
+    """COLMAP's schema forbids NULL in rows and cols; what other programs write may not."""
+    for has_data in (False, True):
+        source = tmp_path / f"{has_data}.db"
+        write_tables(source, 0)
+        for table in ("matches", "keypoints"):
+            columns = ", ".join(column for (_, column, *_) in query(source, f"PRAGMA table_info({table})"))
+            execute(source, f"CREATE TABLE copied AS SELECT {columns} FROM {table}")
+            execute(source, f"DROP TABLE {table}")
+            execute(source, f"ALTER TABLE copied RENAME TO {table}")
+        if not has_data:
+            execute(source, "UPDATE matches SET rows = 0, data = NULL")
+        execute(source, f"UPDATE matches SET {change}")
+        if has_data:
+            with pytest.raises(ValueError, match="table 'matches'"):
+                filter_colmap(source, tmp_path / "out.db", two_view_filter())
+        else:
+            assert filter_colmap(source, tmp_path / "out.db", two_view_filter()).num_matches == 0

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tensor_stereo.interop import hloc
+from tensor_stereo.interop import hdf5
 from tensor_stereo.interop.glue_factory import two_view_filter
-from tensor_stereo.interop.hloc import filter_hloc
+from tensor_stereo.interop.hdf5_matches import filter_hdf5
 from tests.interop.hloc_files import (
     IMAGES,
     features,
@@ -116,7 +116,10 @@ def loose_below(group: Any, keypoints: Any) -> None:
         (change_group("matches0", np.full(50, 50)), "must be -1, -2 or one of 50 keypoints1, got 50 in row 0"),
         (change_group("matches0", np.full(50, -30000)), "got -30000 in row 0"),
         (change_group("matches0", h5py.Empty("i2")), "'matches0' must have shape"),
-        (change_group("matching_scores0", np.zeros(49)), "'matching_scores0' must have 50 rows, got 49"),
+        (
+            change_group("matching_scores0", np.zeros(49)),
+            r"'matching_scores0' must have shape \(50,\) as matches0",
+        ),
         (change_group("matching_scores0", np.full(50, np.nan)), "matching_scores0 must not be NaN, got NaN in row"),
         (change_group("matching_scores0", ["a"] * 50), "'matching_scores0' must hold numbers, got object"),
         (change_keypoints(np.zeros((50, 3))), r"image 'db/1.jpg': 'keypoints' must have shape \(N, 2\), got \(50, 3\)"),
@@ -146,7 +149,7 @@ def test_what_is_wrong_is_named_by_file_and_pair(tmp_path: Path, change: Any, me
     with h5py.File(source, "r+") as file, h5py.File(keypoints, "r+") as points:
         change(file["db-1.jpg/db-2.jpg"], points)
     with pytest.raises(ValueError, match=message) as caught:
-        filter_hloc(source, target, two_view_filter(), keypoints)
+        filter_hdf5(source, target, two_view_filter(), keypoints)
     assert str(tmp_path) in str(caught.value)
     assert (tmp_path / "secret").read_bytes() == bytes(100)
     assert not (tmp_path / "other.h5").exists()
@@ -162,7 +165,7 @@ def test_links_in_place_of_the_results_are_replaced_and_not_followed(tmp_path: P
     with h5py.File(source, "r+") as file:
         file["db-1.jpg/db-2.jpg/score"] = h5py.ExternalLink("other.h5", "/a")
         file["db-1.jpg/db-2.jpg/inlier"] = h5py.ExternalLink("none.h5", "/a")
-    filter_hloc(source, target, two_view_filter(), keypoints)
+    filter_hdf5(source, target, two_view_filter(), keypoints)
     assert (tmp_path / "other.h5").read_bytes() == before
     with h5py.File(target) as result:
         group = result["db-1.jpg/db-2.jpg"]
@@ -178,7 +181,7 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
         for damaged in (data[: len(data) // 2], data[:30] + bytes(60) + data[90:], b""):
             path.write_bytes(damaged)
             with pytest.raises(ValueError, match=path.name):
-                filter_hloc(source, target, two_view_filter(), keypoints)
+                filter_hdf5(source, target, two_view_filter(), keypoints)
         path.write_bytes(data)
     with h5py.File(source, "r+") as file:
         group = file["db-1.jpg/db-2.jpg"]
@@ -189,19 +192,19 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     data[place : place + 8] = bytes(8)
     source.write_bytes(data)
     with pytest.raises(ValueError, match=r"matches\.h5, pair 'db-1.jpg/db-2.jpg' cannot be read"):
-        filter_hloc(source, target, two_view_filter(), keypoints)
+        filter_hdf5(source, target, two_view_filter(), keypoints)
 
 
 def test_the_error_without_h5py_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     with pytest.raises(ImportError, match=r"h5py must be installed to read matches\.h5"):
-        filter_hloc(tmp_path / "matches.h5", tmp_path / "out.h5", two_view_filter(), tmp_path / "features.h5")
+        filter_hdf5(tmp_path / "matches.h5", tmp_path / "out.h5", two_view_filter(), tmp_path / "features.h5")
 
 
 def test_the_limit_is_the_one_of_the_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, target, keypoints = paths(tmp_path)
     write_features(keypoints, features(10))
     write_matches(source, {(IMAGES[0], IMAGES[1]): partners(10)})
-    monkeypatch.setattr(hloc, "MAX_ROWS", 49)
+    monkeypatch.setattr(hdf5, "MAX_ROWS", 49)
     with pytest.raises(ValueError, match="must have at most 49 rows, got 50"):
-        filter_hloc(source, target, two_view_filter(), keypoints)
+        filter_hdf5(source, target, two_view_filter(), keypoints)

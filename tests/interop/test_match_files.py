@@ -203,14 +203,19 @@ def test_out_must_be_another_file_than_the_inputs(tmp_path: Path, monkeypatch: p
 
 def test_wrong_arguments_are_named(tmp_path: Path) -> None:
     source, out = write_source(tmp_path, ".csv", batch(5)).values()
-    with pytest.raises(ValueError, match=r"source must end in \.npz, \.csv, \.parquet, \.h5, \.db, got 'in\.txt'"):
+    with pytest.raises(
+        ValueError, match=r"source must end in \.npz or \.csv or \.parquet or \.h5 or \.db, got 'in\.txt'"
+    ):
         filter_file(tmp_path / "in.txt", out)
     with pytest.raises(ValueError, match=r"out must end in \.csv as source does, got 'out\.npz'"):
         filter_file(source, out.with_suffix(".npz"))
-    with pytest.raises(ValueError, match=r"keypoints must be given for \.h5, and only for it"):
+    with pytest.raises(ValueError, match=r"keypoints must be None but for \.h5"):
         filter_file(source, out, keypoints=source)
-    with pytest.raises(ValueError, match=r"keypoints must be given for \.h5, and only for it"):
-        filter_file(tmp_path / "in.h5", tmp_path / "out.h5")
+    with pytest.raises(ValueError, match=r"score_name must be None for \.h5"):
+        filter_file(tmp_path / "in.h5", tmp_path / "out.h5", score_name="mine")
+    for name in ("", " ", "inlier", "relation"):
+        with pytest.raises(ValueError, match="score_name must be the name of a column besides"):
+            filter_file(source, out, score_name=name)
     with pytest.raises(FileNotFoundError, match="source: there is no file"):
         filter_file(tmp_path / "none.csv", out)
     (tmp_path / "folder.csv").mkdir()

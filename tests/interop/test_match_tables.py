@@ -206,7 +206,7 @@ def test_a_compressed_csv_is_not_inflated(tmp_path: Path, compress: object) -> N
     [
         ({"x0": pl.lit("1")}, None),
         ({"x0": pl.lit(True)}, "column 'x0' must hold a number per row, got Boolean"),
-        ({"group": pl.lit(1.5)}, "column 'group' must hold an integer per row, got Float64"),
+        ({"group": pl.lit(1.5)}, "row 1.*: column 'group' must be an integer, got 1.5"),
         ({"pair": pl.lit(1.5)}, "column 'pair' must hold strings or integers, got Float64"),
         ({"y1": pl.lit(None, dtype=pl.Float32)}, r"row 1 \(pair 0\): column 'y1' is empty"),
         ({"cost": pl.lit(None)}, "column 'cost' must hold a number per row, got Null"),
@@ -266,3 +266,60 @@ def test_columns_of_the_user_are_kept(tmp_path: Path) -> None:
     )
     result = pl.read_parquet(tmp_path / "out.parquet")
     assert result.select(own.columns).equals(own)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_score_of_the_user_survives_filters(tmp_path: Path, ending: str) -> None:
+    users = [float(k - 3) for k in range(40)]
+    table = table_of(batch(3, [40]))
+    plain = filtered(tmp_path, table, ending)
+    own = table.with_columns(pl.Series("score", users), pl.lit("mine").alias("relation"))
+    for _ in range(2):  # the second time on what the first has written
+        own = filtered_as(tmp_path, own, ending)
+        assert own["score"].cast(pl.Float64).to_list() == users
+        assert own["relation"].to_list() == ["mine"] * 40
+        assert own["filter_relation"].to_list() == plain["relation"].to_list()
+        assert own["filter_score"].cast(pl.Float64).to_list() == plain["score"].to_list()
+        assert own.columns == [*table.columns, "score", "relation", "inlier", "filter_score", "filter_relation"]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_name_of_the_score_can_be_chosen(tmp_path: Path, ending: str) -> None:
+    table = table_of(batch(3, [40])).with_columns(pl.lit(7.5).alias("score"))
+    plain = filtered(tmp_path, table_of(batch(3, [40])), ending)
+    for _ in range(2):
+        table = filtered_as(tmp_path, table, ending, score_name="kept")
+        assert table["score"].cast(pl.Float64).to_list() == [7.5] * 40
+        assert table["kept"].cast(pl.Float64).to_list() == plain["score"].to_list()
+    with pytest.raises(ValueError, match=r"score_name must be a new name in .*, which has 'x0'"):
+        filtered_as(tmp_path, table, ending, score_name="x0")
+
+
+def filtered_as(folder: Path, table: pl.DataFrame, ending: str, score_name: str | None = None) -> pl.DataFrame:
+    source, target = folder / f"in{ending}", folder / f"out{ending}"
+    table_files.write_table(table, source)
+    filter_table(source, target, two_view_filter(), score_name=score_name)
+    return table_files.read_csv(target) if ending == ".csv" else table_files.read_parquet(target)
+
+
+def test_tables_of_other_tools_are_read(tmp_path: Path) -> None:
+    """Blanks after commas, 1.0 in a column of integers, blank last lines, Windows line ends, a byte order mark."""
+    table = table_of(batch(3, has_group=True))
+    expected = filtered(tmp_path, table, ".csv")
+    lines = [", ".join(table.columns)]
+    for row in table.iter_rows(named=True):
+        values = [f"{float(value):.1f}" if name == "group" else str(value) for name, value in row.items()]
+        lines.append(", ".join(values))
+    (tmp_path / "in.csv").write_text("\ufeff" + "\r\n".join([*lines, "", " ", ""]), encoding="utf-8", newline="")
+    filter_table(tmp_path / "in.csv", tmp_path / "out.csv", two_view_filter())
+    result = table_files.read_csv(tmp_path / "out.csv")
+    assert len(result) == len(table)
+    for name in ("inlier", "score", "relation"):
+        assert result[name].to_list() == expected[name].cast(pl.String).to_list()
+
+
+@pytest.mark.parametrize("value", ["1.5", "1e300", "nan", "inf", "", "x", "9223372036854775808"])
+def test_a_group_that_is_no_integer_is_named(tmp_path: Path, value: str) -> None:
+    (tmp_path / "in.csv").write_text(f"{HEADER},group\n1,2,3,4,2.0\n1,2,3,4,{value}\n")
+    with pytest.raises(ValueError, match=r"in\.csv, line 3: column 'group' (must be an integer|is empty)"):
+        filter_table(tmp_path / "in.csv", tmp_path / "out.csv", two_view_filter())

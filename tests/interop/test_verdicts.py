@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tensor_stereo import Matches
 from tensor_stereo.batching import collate_matches, split_matches
 from tensor_stereo.interop import verdicts
-from tensor_stereo.interop.glue_factory import from_glue_factory, two_view_filter
-from tensor_stereo.interop.verdicts import FilterSummary, Verdicts, filter_each, filter_matches, pick_matches
+from tensor_stereo.interop.glue_factory import two_view_filter
+from tensor_stereo.interop.verdicts import FilterSummary, Verdicts, filter_each, filter_matches
 from tensor_stereo.modules import FilterOutput
 from tests.interop.match_batches import batch, expected_of_any_views
 
@@ -111,49 +111,6 @@ def test_spread_and_take_undo_each_other(seed: int, n: int) -> None:
     assert not rest.inlier.any()
     assert not rest.score.any()
     assert not rest.relation.any()
-
-
-@given(seeds, st.booleans())
-def test_picked_matches_are_those_of_the_dictionary(seed: int, has_scores: bool) -> None:
-    rng = np.random.default_rng(seed)
-    points0, points1 = rng.random((12, 2)), rng.random((9, 2))
-    matches0 = rng.integers(-2, 9, 12)
-    scores = rng.random(12) if has_scores else None
-    arrays = {"keypoints0": points0, "keypoints1": points1, "matches0": matches0, "matching_scores0": scores}
-    tensors = {name: torch.from_numpy(values)[None] for name, values in arrays.items() if values is not None}
-    same, _ = from_glue_factory(tensors)
-    picked = pick_matches("m", points0, points1, matches0, scores)
-    for name in ("keypoints0", "keypoints1", "ptr", "cost"):
-        a, b = getattr(picked, name), getattr(same, name)
-        assert (a is None and b is None) or torch.equal(a, b), name
-
-
-def test_unmatched_keypoints_and_scores_may_hold_anything() -> None:
-    points = np.array([[0.0, 1.0], [np.nan, np.inf], [2.0, 5.0]])
-    picked = pick_matches("m", points, points, np.array([2, -1]), np.array([0.25, np.nan]))
-    assert picked.keypoints1.tolist() == [[2.0, 5.0]]
-    assert picked.cost is not None
-    assert picked.cost.tolist() == [0.75]
-
-
-@pytest.mark.parametrize(
-    ("matches0", "scores", "message"),
-    [
-        ([0, 3, -1], None, "place: matches0 must be -1, -2 or one of 3 keypoints1, got 3 in row 1"),
-        ([0, -3, -1], None, "place: matches0 .* got -3 in row 1"),
-        ([0, 1, 2, -1], None, "place: matches0 has 4 rows, but there are 3 keypoints0"),
-        ([0, -1, 2], [0.5, 0.5, np.nan], "place: matching_scores0 must not be NaN, got NaN in row 2"),
-        ([-1, 1, 0], None, r"place: keypoints0, row 1, must be finite, .* got \(nan, 3.0\)"),
-        ([1, -1, 0], None, r"place: keypoints1, row 1, must be finite, .* got \(nan, 3.0\)"),
-    ],
-)
-def test_wrong_partners_are_named_by_place_and_row(
-    matches0: list[int], scores: list[float] | None, message: str
-) -> None:
-    points = np.array([[0.0, 1.0], [np.nan, 3.0], [4.0, 5.0]])
-    given_ = None if scores is None else np.array(scores)
-    with pytest.raises(ValueError, match=message):
-        pick_matches("place", points, points, np.array(matches0), given_)
 
 
 def test_the_batch_of_the_tests_has_duplicates_and_all_relations() -> None:

@@ -1,0 +1,218 @@
+"""The forms in which matchers save matches as named arrays.
+
+======================================================  ===============================================================
+arrays                                                  written by
+======================================================  ===============================================================
+``keypoints0``, ``keypoints1`` (M, 2); ``ptr``,         this library, one or many rectified pairs; without ``ptr`` one
+``cost``, ``group``
+``keypoints0``, ``keypoints1``, ``matches0`` (N0,)      LightGlue, glue-factory, SuperGlue (``match_pairs.py``)
+or ``matches1`` (N1,)
+the same with ``matches`` (N0,) or (S, 2)               older SuperGlue, LightGlue; ``matches01`` likewise
+``mkpts0``, ``mkpts1`` (M, 2), or ``mkpts0_f``          LoFTR and the detector-free matchers after it, with ``mconf``
+                                                        and ``m_bids`` or ``b_ids``
+``keypoints0``, ``keypoints1``, ``batch_indexes``       kornia's ``LoFTR`` and ``LocalFeatureMatcher``, with
+                                                        ``confidence``
+======================================================  ===============================================================
+
+Rows of both views are matches only where nothing says otherwise: an array whose name says that it holds indices, and
+which is none of these, is refused by name. Arrays may have a batch axis of one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from tensor_stereo.interop.index_arrays import INDEX_ARRAYS, Indices, index_matches
+from tensor_stereo.interop.verdicts import Array, Int, Verdicts
+from tensor_stereo.ops.segments import check_range
+from tensor_stereo.types import Matches
+
+_POINTS = ("keypoints0", "keypoints1")
+_ROWS = (_POINTS, ("mkpts0", "mkpts1"), ("mkpts0_f", "mkpts1_f"))
+_BATCH = ("batch_indexes", "m_bids", "b_ids")  # the pair of each row
+_CONFIDENCE = ("confidence", "mconf")
+_RAGGED = ("ptr", "cost", "group")  # of this library's own form
+_SAYS_INDEX = re.compile(r"match|mkpt|kpts|corr|ind(ex|ices)|idx|assign|partner|bids|b_ids|batch", re.IGNORECASE)
+
+
+class Header(NamedTuple):
+    """What is known of an array before it is read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+
+
+@dataclass(frozen=True)
+class Form:
+    """How an archive gives its matches.
+
+    Attributes:
+        points0: Name of the keypoints of view 0.
+        points1: Name of the keypoints of view 1.
+        arrays: Names of all arrays that say something of the matches.
+        has_indices: Whether index arrays name the partners; else rows are matches.
+        is_rectified: Whether the form promises rectified pairs.
+    """
+
+    points0: str
+    points1: str
+    arrays: tuple[str, ...]
+    has_indices: bool
+    is_rectified: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ReadPairs:
+    """The matches of an archive, and where their verdicts go.
+
+    Attributes:
+        matches: All pairs.
+        order: (M,) row of the archive of each match; None: the order is the same.
+        shape: Of the results, where rows are matches.
+        indices: Of the matches, where index arrays name them.
+    """
+
+    matches: Matches
+    order: Int | None = None
+    shape: tuple[int, ...] = ()
+    indices: Indices | None = None
+
+    def lay_out(self, verdicts: Verdicts) -> Verdicts:
+        """The verdicts in the layout of the archive."""
+        if self.indices is not None:
+            return verdicts.spread(self.indices.mask)
+        if self.order is not None:
+            verdicts = verdicts.take(np.argsort(self.order, kind="stable"))
+        return verdicts.reshape(self.shape)
+
+
+def find_form(place: str, headers: Mapping[str, Header]) -> Form:
+    """Tell the form of an archive by the names of its arrays.
+
+    Raises:
+        ValueError: If keypoints are missing, or an array says that rows are no matches and is none that is read.
+
+    >>> points = Header((4, 2), np.dtype(float))
+    >>> form = find_form("m.npz", {"mkpts0": points, "mkpts1": points})
+    >>> form.points0, form.has_indices, form.is_rectified
+    ('mkpts0', False, False)
+    """
+    if any(name in headers for name in INDEX_ARRAYS):
+        return _indexed_form(place, headers)
+    has_plain = all(name in headers for name in _POINTS)
+    has_matched = any(all(name in headers for name in names) for names in _ROWS[1:])
+    views = next((names for names in reversed(_ROWS) if all(name in headers for name in names)), None)
+    if views is None:
+        missing = next(name for name in _POINTS if name not in headers)
+        raise ValueError(f"{place} must hold the array {missing!r}, it has {sorted(headers)}")
+    of_others = [name for name in (*_BATCH, *_CONFIDENCE) if name in headers]
+    of_ours = [name for name in _RAGGED if name in headers]
+    batch = next((name for name in _BATCH if name in headers), None)
+    if batch is not None and "ptr" in headers:
+        raise ValueError(f"{place} holds the pair of each row twice, as 'ptr' and as {batch!r}; leave one of them out")
+    arrays = (*views, *of_ours, *of_others)
+    _refuse_unread(place, headers, {*arrays, *(_POINTS if has_plain else ())}, has_matched)
+    return Form(*views, arrays, has_indices=False, is_rectified=not (has_matched or of_others))
+
+
+def _indexed_form(place: str, headers: Mapping[str, Header]) -> Form:
+    for name in _POINTS:
+        if name not in headers:
+            raise ValueError(f"{place} must hold the array {name!r}, it has {sorted(headers)}")
+    indices = [name for name in INDEX_ARRAYS if name in headers]
+    for name in _RAGGED:
+        if name in headers:
+            raise ValueError(f"{place} holds {indices[0]!r} of one pair, so that {name!r} has no meaning")
+    scores = [name for index in indices[:1] for name in INDEX_ARRAYS[index] if name in headers]
+    return Form(*_POINTS, (*_POINTS, *indices, *scores), has_indices=True, is_rectified=False)
+
+
+def _refuse_unread(place: str, headers: Mapping[str, Header], known: set[str], has_matched: bool) -> None:
+    """Raise for an array that seems to say which rows are matches."""
+    for name, header in headers.items():
+        is_points = "mkpt" in name.casefold() and not has_matched
+        if name in known or name.startswith("gt_") or not _SAYS_INDEX.search(name):
+            continue
+        if (header.dtype.kind in "iub" and header.shape) or is_points:
+            read = ", ".join((*INDEX_ARRAYS, *_BATCH, "mkpts0 with mkpts1"))
+            raise ValueError(
+                f"{place} pairs the rows of its keypoints, but the array {name!r} may say otherwise and is not read; "
+                f"read are {read}. Rename it to one of these or leave it out"
+            )
+
+
+def form_matches(place: str, form: Form, arrays: Mapping[str, Array]) -> ReadPairs:
+    """The matches that arrays of a known form give.
+
+    Raises:
+        ValueError: If a shape, dtype or value is wrong; the message names array, pair and row.
+    """
+    for name, array in arrays.items():
+        kinds = "iu" if name in ("ptr", "group", *_BATCH) else "fiu"
+        if array.dtype.kind not in kinds:
+            expected = "integers" if kinds == "iu" else "numbers"
+            raise ValueError(f"{place}, array {name!r} must hold {expected}, got {array.dtype}")
+    if form.has_indices:
+        matches, indices = index_matches(place, arrays)
+        return ReadPairs(matches, indices=indices)
+    shape = arrays[form.points0].shape
+    flat = {name: _rows(place, name, array, form) for name, array in arrays.items()}
+    num_matches = len(flat[form.points0])
+    for name, values in flat.items():
+        if name != "ptr" and len(values) != num_matches:
+            raise ValueError(f"{place}: {name} must have {num_matches} rows as {form.points0} has, got {len(values)}")
+    ptr, order = _pairs(flat, num_matches)
+    cost = flat.get("cost")
+    confidence = next((flat[name] for name in _CONFIDENCE if name in flat), None)
+    if cost is None and confidence is not None:
+        cost = 1 - confidence.astype(np.float64)
+    columns = (flat[form.points0], flat[form.points1], cost, flat.get("group"))
+    dtypes = (np.float64, np.float64, np.float64, np.int64)
+    points0, points1, cost_, group = (
+        None if values is None else torch.from_numpy((values if order is None else values[order]).astype(dtype))
+        for values, dtype in zip(columns, dtypes, strict=True)
+    )
+    try:
+        matches = Matches(points0, points1, torch.from_numpy(ptr), cost_, group)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
+
+    def describe(name: str, row: int) -> str:
+        given = row if order is None else int(order[row])
+        return f"{place}: {name}, row {given} (pair {np.searchsorted(ptr, row, side='right') - 1}),"
+
+    check_range(matches.keypoints0.numpy(), lambda row: describe(form.points0, row))
+    check_range(matches.keypoints1.numpy(), lambda row: describe(form.points1, row))
+    if matches.cost is not None and bool(matches.cost.isnan().any()):
+        name = next(name for name in ("cost", *_CONFIDENCE) if name in flat)
+        raise ValueError(f"{describe(name, int(matches.cost.isnan().int().argmax()))} must not be NaN")
+    return ReadPairs(matches, order, shape[:-1])
+
+
+def _rows(place: str, name: str, array: Array, form: Form) -> Array:
+    """An array with one entry per row, without a batch axis of one."""
+    ndim = 2 if name in (form.points0, form.points1) else 1
+    rows = array[0] if array.ndim == ndim + 1 and len(array) == 1 else array
+    if rows.ndim != ndim or (ndim == 2 and rows.shape[1] != 2):
+        raise ValueError(
+            f"{place}, array {name!r} must have shape {'(N, 2)' if ndim == 2 else '(N,)'}, got {array.shape}"
+        )
+    return rows
+
+
+def _pairs(flat: Mapping[str, Array], num_matches: int) -> tuple[Int, Int | None]:
+    """(B + 1,) offsets of the pairs, and the order of the rows that makes pairs whole."""
+    batch = next((flat[name] for name in _BATCH if name in flat), None)
+    if batch is None:
+        ptr = flat.get("ptr")
+        return np.array([0, num_matches]) if ptr is None else ptr.astype(np.int64), None
+    if num_matches == 0:
+        return np.array([0, 0]), None
+    counts = np.unique(batch, return_counts=True)[1]
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), np.argsort(batch, kind="stable")

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tensor_stereo.evaluation.dataset import score_dataset as score_dataset
     from tensor_stereo.graphs import build_graphs as build_graphs
     from tensor_stereo.interop.match_files import filter_file as filter_file
+    from tensor_stereo.interop.match_folders import filter_files as filter_files
     from tensor_stereo.modules import DelaunayFilter as DelaunayFilter
     from tensor_stereo.modules import FilterOutput as FilterOutput
     from tensor_stereo.ops.backends import backend as backend
@@ -64,6 +65,7 @@ __getattr__, __dir__, __all__ = attach(
         "classify_matches": "classification",
         "filter_disparity": "dense.filtering",
         "filter_file": "interop.match_files",
+        "filter_files": "interop.match_folders",
         "interpolate_disparity": "dense.interpolation",
         "run_pipeline": "pipeline",
         "score_dataset": "evaluation.dataset",

@@ -10,6 +10,9 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 
+MAX_ROWS = 1 << 26  # of a table or array that comes from elsewhere: 1 GB of coordinates
+
+
 class LimitError(ValueError):
     """A setting lies outside of its limits, whatever the others are."""
 

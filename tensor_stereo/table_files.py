@@ -14,9 +14,9 @@ from typing import IO, Any
 
 import polars as pl
 
+from tensor_stereo.limits import MAX_ROWS
 from tensor_stereo.paths import has_ending
 
-MAX_ROWS = 1 << 26  # of a table that comes from elsewhere: 1 GB of coordinates
 _MAX_DECODE_SECONDS = 600
 # Polars would inflate such a file, whatever its ending says, and to any size: gzip, zlib, Zstandard.
 _COMPRESSED = (b"\x1f\x8b", b"x\x01", b"x\x9c", b"x\xda", b"\x28\xb5\x2f\xfd")

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
-from tensor_stereo.datasets.files import check_gt_scale
+from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
 from tensor_stereo.interop.formats import check_files
+from tensor_stereo.interop.match_lists import find_match_files, is_many
+from tensor_stereo.interop.result_names import check_score_name
 from tensor_stereo.paths import TABLES, check_apart, check_folder, check_source, prepare_folder, prepare_target
 
 FIGURES = (".png",)
@@ -46,17 +48,23 @@ def _check_classify(command: Classify) -> None:
             check_apart(name, path, sources)
             prepare_target(name, path, endings)
     check_gt_scale(command.gt_scale)
+    check_sample_bits(command.sample_bits)
 
 
 def _check_evaluate(command: Evaluate) -> None:
     check_folder("root", command.root)
     check_gt_scale(command.gt_scale)
+    check_sample_bits(command.sample_bits)
     if command.out is not None:
         prepare_folder("out", command.out)
 
 
 def _check_filter(command: Filter) -> None:
-    ending = check_files(command.matches, command.out, command.keypoints)
+    if is_many(command.matches, command.out):
+        check_score_name(command.score_name)
+        find_match_files(command.matches, command.out, command.keypoints)
+        return
+    ending = check_files(command.matches, command.out, command.keypoints, command.score_name)
     if ending != ".npz":  # an archive is opened later, to see what form it has
         command.config.resolve(rectified=ending not in (".h5", ".db"))
 
@@ -86,6 +94,7 @@ def _check_index(command: Index) -> None:
     for root in command.roots:
         if not root.exists():
             raise FileNotFoundError(f"roots: there is no file or folder {root}")
+    check_sample_bits(command.sample_bits)
     prepare_target("out", command.out, (".parquet",))
 
 

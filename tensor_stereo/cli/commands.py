@@ -38,6 +38,8 @@ class Classify:
     """Ground-truth disparity of view 0: PFM, 8-bit or 16-bit PNG."""
     gt_scale: float | None = None
     """Stored value / px of disparity in a PNG map."""
+    sample_bits: int | None = None
+    """Bits in use, 8 to 16, of views that store 16 bits per sample and do not tell."""
     out: Path | None = None
     """Table of matches and verdicts, .csv or .parquet."""
     figure: Path | None = None
@@ -57,6 +59,8 @@ class Evaluate:
     """paper: SIFT with ratio 0.6, as in Lowe's demo program."""
     gt_scale: float | None = None
     """Stored value / px of disparity, where the folder layout does not tell it."""
+    sample_bits: int | None = None
+    """Bits in use, 8 to 16, of views that store 16 bits per sample and do not tell."""
     out: Path | None = None
     """Folder for summary.json, settings.json, the tables and one figure per scene and detector."""
     config: Annotated[EvaluationConfig, Flat] = field(default_factory=EvaluationConfig)
@@ -64,14 +68,20 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Filter:
-    """Decide which matches of a file are right, and write the file again with verdict and score."""
+    """Decide which matches of a file are right, and write the file again with verdict and score.
+
+    The same for all files of a folder, or of a list of paths; a call that ended early goes on where it was.
+    """
 
     matches: tyro.conf.Positional[Path]
-    """Putative matches: .npz, .csv, .parquet, hloc's .h5, COLMAP's .db."""
+    """Putative matches: .npz, .csv, .parquet, .h5 of hloc, DISK or glue-factory, COLMAP's .db; or a folder of such
+    files, or a .csv or .parquet list of them with the column matches."""
     out: Path
-    """File to write, with the same ending."""
+    """File to write, with the same ending; for a folder or a list the folder of the results."""
     keypoints: Path | None = None
-    """hloc's file of features, for .h5."""
+    """File of keypoints that belongs to an .h5 of hloc or DISK."""
+    score_name: str | None = None
+    """Name of the score in .npz, .csv and .parquet: score, or filter_score beside a score of yours, if not given."""
     config: Annotated[FileFilterConfig, Flat] = field(default_factory=FileFilterConfig)
 
 
@@ -96,6 +106,8 @@ class Index:
     """Parquet file to write."""
     gt_scale: float | None = None
     """Stored value / px of disparity, where the folder layout does not tell it."""
+    sample_bits: int | None = None
+    """Bits in use, 8 to 16, of views that store 16 bits per sample and do not tell."""
 
 
 @dataclass(frozen=True)

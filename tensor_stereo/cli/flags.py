@@ -34,7 +34,7 @@ def name_flags(message: str) -> str:
     message = re.sub(rf"^({names})(?=:| must\b| needs\b)", lambda found: _flag(found[1]), message)
     message = re.sub(rf"(?<=; )({names})(?= needs)", lambda found: _flag(found[1]), message)
     message = re.sub(r"(?<= as )(source)(?= does)", lambda found: _flag(found[1]), message)
-    message = re.sub(r"(?<=another file than )(\w+)", lambda found: _flag(found[1]), message)
+    message = re.sub(r"(another (?:file|folder) than )(\w+)", lambda found: found[1] + _flag(found[2]), message)
     message = re.sub(rf"(?<=must be None beside )({names})\b", lambda found: _flag(found[1]), message)
     return message.replace("the verdict 'score'", "--verdict score").replace(
         "the score 'consensus' with consensus=UNRECTIFIED, or the verdict 'cardinality'",

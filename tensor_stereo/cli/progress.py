@@ -37,7 +37,12 @@ def show_progress(name: str) -> Iterator[Show]:
 
         yield print_line
         return
-    columns = TextColumn(name, markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}", markup=False)
+    columns = (
+        TextColumn(name, markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[text]}", markup=False),
+    )
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(name, total=None, text="")
         yield lambda done, total, text="": progress.update(task, completed=done, total=total, text=text)

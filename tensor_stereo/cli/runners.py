@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,6 +18,9 @@ from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filte
 from tensor_stereo.cli.endings import OK, fail, most_frequent
 from tensor_stereo.cli.progress import show_progress, time_left
 from tensor_stereo.configs import EvaluationConfig
+
+if TYPE_CHECKING:
+    from tensor_stereo.interop.verdicts import FilterSummary
 
 # The library is imported where it is called: no command waits for what it does not use.
 
@@ -48,7 +51,7 @@ def _run_evaluate(command: Evaluate) -> int:
     config = command.config
     if command.preset == "paper":
         config = replace(config, sift=replace(config.sift, max_ratio=0.6))
-    found = find_pairs(command.root, scenes=command.scenes, gt_scale=command.gt_scale)
+    found = find_pairs(command.root, scenes=command.scenes, gt_scale=command.gt_scale, sample_bits=command.sample_bits)
     files = [pair for pair in found if pair.disparity_gt is not None]
     if not files:
         return fail(f"none of the {len(found)} pairs below {command.root} has ground truth, which an evaluation needs")
@@ -82,7 +85,7 @@ def _run_evaluate(command: Evaluate) -> int:
 def _run_index(command: Index) -> int:
     from tensor_stereo.datasets import build_manifest, write_manifest
 
-    manifest = build_manifest(command.roots, gt_scale=command.gt_scale)
+    manifest = build_manifest(command.roots, gt_scale=command.gt_scale, sample_bits=command.sample_bits)
     write_manifest(manifest, command.out)
     for dataset, count in sorted(Counter(manifest["dataset"]).items()):
         print(f"{dataset}: {count} pairs")
@@ -92,8 +95,36 @@ def _run_index(command: Index) -> int:
 
 def _run_filter(command: Filter) -> int:
     from tensor_stereo.interop.match_files import filter_file
+    from tensor_stereo.interop.match_lists import is_many
 
-    summary = filter_file(command.matches, command.out, keypoints=command.keypoints, config=command.config)
+    settings = {name: getattr(command, name) for name in ("keypoints", "score_name", "config")}
+    if is_many(command.matches, command.out):
+        return _filter_many(command, settings)
+    return _print_counts(filter_file(command.matches, command.out, **settings))
+
+
+def _filter_many(command: Filter, settings: dict[str, Any]) -> int:
+    from tensor_stereo.interop.match_folders import filter_files
+
+    begun = time.monotonic()
+    with show_progress("filter") as show:
+        summary = filter_files(
+            command.matches,
+            command.out,
+            **settings,
+            on_progress=lambda done, total, name: show(done, total, f"{name}, {time_left(begun, done, total)}"),
+        )
+    print(f"{'num_files':20}{summary.num_files:8}")
+    print(f"{'num_found':20}{summary.num_found:8}")
+    code = _print_counts(summary.matches)
+    for name, reason in summary.errors.items():
+        fail(f"{name}: {reason}")
+    if summary.errors:
+        return fail(f"{len(summary.errors)} of {summary.num_files} files failed")
+    return code
+
+
+def _print_counts(summary: FilterSummary) -> int:
     values = asdict(summary)
     num_agreeing = values.pop("num_agreeing")
     for name, value in values.items():
@@ -150,6 +181,7 @@ def _run_classify(command: Classify) -> int:
         command.config,
         disparity_gt=command.disparity_gt,
         gt_scale=command.gt_scale,
+        sample_bits=command.sample_bits,
         out=command.out,
         figure=command.figure,
     )

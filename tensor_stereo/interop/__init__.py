@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tensor_stereo.interop.kornia import to_lightglue as to_lightglue
     from tensor_stereo.interop.kornia import to_loftr as to_loftr
     from tensor_stereo.interop.match_files import filter_file as filter_file
+    from tensor_stereo.interop.match_folders import FolderSummary as FolderSummary
+    from tensor_stereo.interop.match_folders import filter_files as filter_files
     from tensor_stereo.interop.opencv import from_opencv as from_opencv
     from tensor_stereo.interop.opencv import select_dmatches as select_dmatches
     from tensor_stereo.interop.opencv import to_opencv as to_opencv
@@ -33,9 +35,11 @@ __getattr__, __dir__, __all__ = attach(
     {
         "FilterSummary": "verdicts",
         "FilteredMatcher": "kornia",
+        "FolderSummary": "match_folders",
         "GlueFactoryFilter": "glue_factory",
         "LocatedFeature": "kornia",
         "filter_file": "match_files",
+        "filter_files": "match_folders",
         "from_edge_index": "pyg",
         "from_glue_factory": "glue_factory",
         "from_lafs": "kornia",

@@ -27,7 +27,7 @@ from tensor_stereo.interop.verdicts import (
     filter_each,
     pair_matches,
 )
-from tensor_stereo.table_files import MAX_ROWS
+from tensor_stereo.limits import MAX_ROWS
 from tensor_stereo.types import Matches
 
 TABLE = "tensor_stereo_verdicts"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tensor_stereo.interop.hdf5 import find_exported, open_file
 from tensor_stereo.interop.result_names import check_score_name
 from tensor_stereo.paths import check_apart, check_ending, check_source, has_ending, prepare_target
 
@@ -49,6 +48,8 @@ def check_files(source: Path, out: Path, keypoints: Path | None, score_name: str
             if file.read(len(first)) != first:
                 raise ValueError(f"{path} is no {called}, whatever its ending says")
     if ending == ".h5" and keypoints is None:
+        from tensor_stereo.interop.hdf5 import find_exported, open_file
+
         with open_file(source) as file:
             find_exported(source, file)
     prepare_target("out", out)

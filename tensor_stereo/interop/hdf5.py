@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tensor_stereo.table_files import MAX_ROWS
+from tensor_stereo.limits import MAX_ROWS
 
 Array = NDArray[Any]
 OF_PAIR = ("keypoints0", "keypoints1")

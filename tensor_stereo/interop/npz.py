@@ -15,7 +15,7 @@ import numpy as np
 from tensor_stereo.interop.npz_forms import Header, find_form, form_matches
 from tensor_stereo.interop.result_names import name_results, result_in
 from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, filter_matches, is_score
-from tensor_stereo.table_files import MAX_ROWS
+from tensor_stereo.limits import MAX_ROWS
 from tensor_stereo.types import Relation
 
 _HEADER_BYTES = 10_000  # what NumPy itself accepts of a header, by default

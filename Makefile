@@ -12,10 +12,10 @@ CMAKE := $(BIN)/cmake
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto
 
 .DEFAULT_GOAL := help
-.PHONY: help dev demo test check format lint types imports slow kernels sanitize fuzz package bench hooks clean
+.PHONY: help dev demo test check format lint types imports slow kernels sanitize fuzz fuzz-files package bench hooks clean
 
 help:  ## Show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 dev: $(READY)  ## Build the environment in .venv (a torch that is there already stays)
 
@@ -64,6 +64,9 @@ fuzz: $(READY)  ## Fuzz the graph builder for a minute (needs clang++ with libFu
 	  -DCMAKE_BUILD_TYPE=RelWithDebInfo -DCMAKE_CXX_COMPILER=$(CLANG)
 	$(CMAKE) --build build/fuzz --parallel
 	build/fuzz/fuzz_delaunay_graph -max_total_time=60 -max_len=512
+
+fuzz-files: $(READY)  ## Read 2000 damaged files of each format (an hour); findings go to build/fuzz-files
+	$(BIN)/python -m tests.fuzz --count 2000
 
 package: $(READY)  ## Build a wheel, install it into a fresh environment and run it away from the sources
 	rm -rf build/package && mkdir -p build/package/run

@@ -30,6 +30,9 @@ Command = (
 )
 
 
+_IN_ONE_LINE = ("DomainWarning", "SampleRangeWarning")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; bad input ends in one line on standard error and exit code 2."""
     if list(sys.argv[1:] if arguments is None else arguments) == ["--version"]:
@@ -46,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         check(command)
         run = _runner(command)
-        with _domain_warnings_in_one_line():
+        with _warnings_in_one_line():
             code = run(command)
     except (ValueError, TypeError, ImportError, SweepError, OSError, UserWarning) as error:
         sys.exit(fail(_one_line(error), BAD_INPUT))
@@ -91,15 +94,16 @@ def _parse(arguments: Sequence[str] | None) -> Any:
 
 
 @contextlib.contextmanager
-def _domain_warnings_in_one_line() -> Iterator[None]:
-    """Say once of each kind, as errors are said, that a score is used outside of its domain."""
+def _warnings_in_one_line() -> Iterator[None]:
+    """Say as errors are said, once of each kind, that a score leaves its domain or that samples have no known range."""
     show, seen = warnings.showwarning, set()
 
     def show_line(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if category.__name__ != "DomainWarning":
+        if category.__name__ not in _IN_ONE_LINE:
             show(message, category, *rest)
             return
-        kind = str(message).partition(", but")[0]
+        is_domain = category.__name__ == "DomainWarning"
+        kind = str(message).partition(", but")[0] if is_domain else category.__name__
         if kind not in seen:
             seen.add(kind)
             fail(f"warning: {name_flags(str(message))}")

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tensor_stereo.datasets.download.fetch import download_releases as download_releases
     from tensor_stereo.datasets.eth3d import find_eth3d as find_eth3d
     from tensor_stereo.datasets.files import PairFiles as PairFiles
+    from tensor_stereo.datasets.images import SampleRangeWarning as SampleRangeWarning
     from tensor_stereo.datasets.images import read_disparity_png as read_disparity_png
     from tensor_stereo.datasets.images import read_image as read_image
     from tensor_stereo.datasets.images import read_occlusion_mask as read_occlusion_mask
@@ -37,6 +38,7 @@ __getattr__, __dir__, __all__ = attach(
         "Calibration": "camera",
         "PairDataset": "pairs",
         "PairFiles": "files",
+        "SampleRangeWarning": "images",
         "SyntheticDataset": "synthetic.rendering",
         "build_manifest": "manifest",
         "download_releases": "download.fetch",

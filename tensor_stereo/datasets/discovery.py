@@ -8,7 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from tensor_stereo.datasets.eth3d import eth3d_pairs
-from tensor_stereo.datasets.files import PairFiles, StrPath, check_gt_scale, collect_pairs, missing_scale
+from tensor_stereo.datasets.files import (
+    PairFiles,
+    StrPath,
+    check_gt_scale,
+    check_sample_bits,
+    collect_pairs,
+    missing_scale,
+)
 from tensor_stereo.datasets.kitti import kitti_pairs
 from tensor_stereo.datasets.middlebury import middlebury_pairs
 from tensor_stereo.datasets.sceneflow import sceneflow_pairs
@@ -20,16 +27,26 @@ _EXPECTED = """\
   Middlebury 2005, 2006:     SCENE/view1, view5, disp1 (png)
   Middlebury 2014, 2021:     SCENE/im0.png, im1.png, disp0.pfm
   MiddEval3, ETH3D two-view: SCENE/im0.png, im1.png, disp0GT.pfm
-  KITTI 2012:                training/colored_0, colored_1 (or image_0, image_1), disp_occ/*_10.png
-  KITTI 2015:                training/image_2, image_3, disp_occ_0/*_10.png
+  KITTI 2012:                training/colored_0, colored_1 (or image_0, image_1), disp_occ, disp_noc/*_10.png
+  KITTI 2015:                training/image_2, image_3, disp_occ_0, disp_noc_0/*_10.png
+  KITTI raw:                 *_drive_*_sync/image_02, image_03/data/*.png (*_extract is not rectified)
+  KITTI odometry, object:    SEQUENCE/image_2, image_3/000000.png
   Scene Flow:                frames_cleanpass, frames_finalpass/**/left, right/*.png, disparity/**/left/*.pfm
-  Sintel stereo:             training/clean_left, clean_right, final_left, final_right, disparities/*/frame_*.png"""
+  FlyingThings3D subset:     train, val/image_clean, image_final/left, right/*.png, disparity/left/*.pfm
+  Sintel stereo:             training/clean_left, clean_right, final_left, final_right, disparities/*/frame_*.png
+  Views may also be ppm, pgm, tif, tiff, bmp, webp, jpg or jpeg, and endings in capitals."""
 
 
 _READERS = (middlebury_pairs, kitti_pairs, eth3d_pairs, sceneflow_pairs, sintel_pairs)
 
 
-def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: float | None = None) -> list[PairFiles]:
+def find_pairs(
+    root: StrPath,
+    *,
+    scenes: Iterable[str] | None = None,
+    gt_scale: float | None = None,
+    sample_bits: int | None = None,
+) -> list[PairFiles]:
     """Find the stereo pairs of every known release in ``root`` and below.
 
     Pairs of one dataset and scene (a release in several sizes) are told apart by the folder that holds the scene, which
@@ -41,16 +58,18 @@ def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: 
             have a scene of that name; a bare name selects all of them. None takes every pair.
         gt_scale: stored value / gt_scale = disparity in px, for the 8-bit maps of Middlebury 2001-2006. It replaces the
             scale that release and size tell; maps whose format fixes the scale (PFM, KITTI) keep theirs.
+        sample_bits: bits in use of views that store 16 bits per sample and do not tell, as
+            :func:`~tensor_stereo.datasets.read_image` takes them.
 
     Returns:
         Pairs sorted by (dataset, scene without case, path).
 
     Raises:
         FileNotFoundError, NotADirectoryError: if ``root`` is no folder.
-        TypeError: if ``scenes`` is one string.
+        TypeError: if ``scenes`` is one string, or ``sample_bits`` no integer.
         ValueError: if no pair is found (lists what was looked for), a scene is missing (lists those found), ``scenes``
-            is empty, ``gt_scale`` is not positive, a scene is incomplete, or the scale of a selected map is open and
-            ``gt_scale`` is None (the message asks for ``--gt-scale``).
+            is empty, ``gt_scale`` is not positive, ``sample_bits`` lies outside of [8, 16], a scene is incomplete, or
+            the scale of a selected map is open and ``gt_scale`` is None (the message asks for ``--gt-scale``).
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as root:
@@ -62,12 +81,15 @@ def find_pairs(root: StrPath, *, scenes: Iterable[str] | None = None, gt_scale: 
     [('middlebury-2005', 'Art', 3.0)]
     """
     check_gt_scale(gt_scale)
+    check_sample_bits(sample_bits)
     pairs = collect_pairs(root, _READERS)
     if not pairs:
         raise ValueError(f"no stereo pairs in {root} or below; looked for these layouts:\n{_EXPECTED}")
     pairs = _tell_apart(pairs, Path(root))
     if scenes is not None:
         pairs = _select(pairs, scenes)
+    if sample_bits is not None:
+        pairs = [replace(pair, sample_bits=int(sample_bits)) for pair in pairs]
     if gt_scale is not None:
         return [replace(pair, gt_scale=gt_scale) if _has_release_scale(pair) else pair for pair in pairs]
     for pair in pairs:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, find_file, find_views, parent_names
+from tensor_stereo.datasets.files import (
+    PairFiles,
+    StrPath,
+    collect_pairs,
+    find_file,
+    find_views,
+    image_names,
+    list_files,
+    parent_names,
+)
 
 _FOLDER = re.compile(
     r"eth3d(?:[-_ ]?(?:stereo|low[-_]?res|two[-_]?view))*|two_view_(?:training|test|testing)", re.IGNORECASE
@@ -16,10 +25,10 @@ _SCENE = re.compile(r"[a-z]\w*_\d[ls]", re.IGNORECASE)  # playground_1l, sand_bo
 def find_eth3d(root: StrPath) -> list[PairFiles]:
     """Find ETH3D's two-view pairs in ``root`` and below; no image is opened.
 
-    A scene holds im0.png and im1.png; its ground truth disp0GT.pfm (px) and mask0nocc.png lie beside them, or in the
-    folder of the same name under ``two_view_training_gt``, as the archives unpack. Middlebury uses the same file names:
-    a scene counts as ETH3D's if a folder above it is named ``eth3d`` or ``two_view_training``, or by its own name, as
-    ``playground_1l``.
+    A scene holds im0.png and im1.png, or images with other endings; its ground truth disp0GT.pfm (px) and mask0nocc.png
+    lie beside them, or in the folder of the same name under ``two_view_training_gt``, as the archives unpack.
+    Middlebury uses the same file names: a scene counts as ETH3D's if a folder above it is named ``eth3d`` or
+    ``two_view_training``, or by its own name, as ``playground_1l``.
 
     Args:
         root: a folder with releases, the release, or one scene's folder.
@@ -62,11 +71,12 @@ def eth3d_pairs(folder: Path) -> list[PairFiles]:
     """
     if not is_eth3d_scene(folder):
         return []
-    views = find_views(folder, ["im0.png"], ["im1.png"], ["disp0GT.pfm"])
+    files = list_files(folder)
+    views = find_views(files, image_names("im0"), image_names("im1"), ["disp0GT.pfm"])
     if views is None:
         return []
     scene, release, *_ = parent_names(folder)
-    truth = folder if views.disparity_gt is not None else folder.parent.with_name(f"{release}_gt") / scene
+    truth = files if views.disparity_gt is not None else list_files(folder.parent.with_name(f"{release}_gt") / scene)
     disparity = find_file(truth, ["disp0GT.pfm"])
     return [
         PairFiles(
@@ -77,6 +87,6 @@ def eth3d_pairs(folder: Path) -> list[PairFiles]:
             disparity_gt=disparity,
             gt_scale=None if disparity is None else 1.0,
             mask=find_file(truth, ["mask0nocc.png"]),
-            calibration=find_file(folder, ["calib.txt"]),
+            calibration=find_file(files, ["calib.txt"]),
         )
     ]

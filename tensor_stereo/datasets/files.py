@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, SupportsIndex, TypeAlias
+
+from tensor_stereo.limits import LimitError, Within
+from tensor_stereo.paths import has_ending
 
 StrPath: TypeAlias = str | os.PathLike[str]
-GT_ENCODINGS = ("scaled", "sintel")
+GT_ENCODINGS = ("scaled", "sintel", "flyingthings3d-subset")
+# Of views. The first that is there is taken; ground truth is never JPEG or WebP, which lose values.
+IMAGE_ENDINGS = (".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
+SAMPLE_BITS = Within(8, 16)
 
 MAX_DEPTH = 6  # data/middlebury/scenes2005/FullSize/zip-2views/Art, with one level to spare
 _SKIPPED = re.compile(r"\..*|__MACOSX|Illum\d+", re.IGNORECASE)  # Illum: the same scene under other lights (2005, 2006)
@@ -30,8 +36,10 @@ class PairFiles:
         mask: ``mask0nocc.png`` of MiddEval3 and ETH3D.
         disparity_noc_gt: KITTI's map that holds the visible pixels only, on the scale of ``disparity_gt``.
         calibration: ``calib.txt`` in Middlebury's format.
-        gt_encoding: how the maps hold their values: ``scaled`` (value / gt_scale, or PFM), or ``sintel`` (three
-            channels, as its archive says).
+        gt_encoding: how the maps hold their values: ``scaled`` (value / gt_scale, or PFM), ``sintel`` (three
+            channels, as its archive says), or ``flyingthings3d-subset`` (PFM with the sign of the optical flow, and
+            masks that are not 0 where occluded).
+        sample_bits: bits in use of views that store 16 bits per sample and do not tell; None where nothing says so.
     """
 
     dataset: str
@@ -44,6 +52,7 @@ class PairFiles:
     disparity_noc_gt: Path | None = None
     calibration: Path | None = None
     gt_encoding: str = "scaled"
+    sample_bits: int | None = None
 
 
 FolderReader: TypeAlias = Callable[[Path], list[PairFiles]]
@@ -88,13 +97,85 @@ def collect_pairs(root: StrPath, readers: Sequence[FolderReader]) -> list[PairFi
     return sorted(pairs, key=lambda pair: (pair.dataset, pair.scene.casefold(), str(pair.image0)))
 
 
-def find_file(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the first of ``names`` that is a file in ``folder``, or None.
+def list_files(folder: Path) -> dict[str, Path]:
+    """The files directly in a folder by their names without case; none if there is no such folder.
 
-    >>> find_file(Path("no/such/folder"), ["im0.png"]) is None
-    True
+    One look at the folder is cheaper than one at each file of a large release. Where names differ in case only, the one
+    with small letters is taken.
+
+    >>> list_files(Path("no/such/folder"))
+    {}
     """
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    try:
+        with os.scandir(folder) as entries:
+            names = sorted((entry.name for entry in entries if entry.is_file()), reverse=True)
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    found: dict[str, Path] = {}
+    for name in names:  # small letters come after capitals, so first here
+        found.setdefault(name.casefold(), folder / name)
+    return found
+
+
+def find_file(files: Mapping[str, Path], names: Sequence[str]) -> Path | None:
+    """Return the first of ``names`` among the files of a folder, in any case, or None.
+
+    >>> find_file({"im0.png": Path("IM0.PNG")}, ["im0.png"]).name
+    'IM0.PNG'
+    """
+    return next((files[name.casefold()] for name in names if name.casefold() in files), None)
+
+
+def image_names(stem: str) -> list[str]:
+    """The names that a view may have.
+
+    >>> image_names("im0")[:2]
+    ['im0.png', 'im0.ppm']
+    """
+    return [stem + ending for ending in IMAGE_ENDINGS]
+
+
+def list_frames(folder: Path) -> dict[str, Path]:
+    """The images directly in a folder by their names without ending, sorted; each frame once.
+
+    >>> list_frames(Path("no/such/folder"))
+    {}
+    """
+    found: dict[str, Path] = {}
+    for path in list_files(folder).values():
+        if has_ending(path, IMAGE_ENDINGS):
+            other = found.setdefault(path.stem, path)
+            if _rank(path) < _rank(other):
+                found[path.stem] = path
+    return dict(sorted(found.items()))
+
+
+def _rank(path: Path) -> int:
+    return IMAGE_ENDINGS.index(path.suffix.casefold())
+
+
+def pair_frames(
+    folder0: Path, folder1: Path, pattern: re.Pattern[str] = re.compile(".*")
+) -> list[tuple[str, Path, Path]]:
+    """Name, left view and right view of the frames in two folders.
+
+    Args:
+        folder0: Folder of the left views.
+        folder1: Folder of the right views.
+        pattern: Names without ending that are looked at.
+
+    Raises:
+        ValueError: if the right view of a frame is missing.
+
+    >>> pair_frames(Path("no/such/left"), Path("no/such/right"))
+    []
+    """
+    frames0 = {stem: path for stem, path in list_frames(folder0).items() if pattern.fullmatch(stem)}
+    frames1 = list_frames(folder1) if frames0 else {}
+    for stem, image0 in frames0.items():
+        if stem not in frames1:
+            raise ValueError(f"{image0} has no right view: {folder1 / image0.name} is missing")
+    return [(stem, image0, frames1[stem]) for stem, image0 in frames0.items()]
 
 
 class Views(NamedTuple):
@@ -105,21 +186,27 @@ class Views(NamedTuple):
     disparity_gt: Path | None
 
 
-def find_views(folder: Path, names0: Sequence[str], names1: Sequence[str], names_gt: Sequence[str]) -> Views | None:
-    """Return the files of a layout, or None if ``folder`` is no scene of it.
+def find_views(
+    files: Mapping[str, Path], names0: Sequence[str], names1: Sequence[str], names_gt: Sequence[str]
+) -> Views | None:
+    """Return the files of a layout among those of a folder, or None if it is no scene of that layout.
 
     Raises:
         ValueError: if the disparity map and one view are there but not the other, as after a partial unpacking.
 
-    >>> find_views(Path("no/such/folder"), ["im0.png"], ["im1.png"], ["disp0.pfm"]) is None
+    >>> find_views({}, ["im0.png"], ["im1.png"], ["disp0.pfm"]) is None
     True
     """
-    image0, image1, disparity = (find_file(folder, names) for names in (names0, names1, names_gt))
+    image0, image1, disparity = (find_file(files, names) for names in (names0, names1, names_gt))
     if image0 is not None and image1 is not None:
         return Views(image0, image1, disparity)
     if disparity is not None and (image0 is not None or image1 is not None):
         missing = names0 if image0 is None else names1
-        raise ValueError(f"{folder} holds {disparity.name} and one view, but not the other: no {' or '.join(missing)}")
+        folder, names = (
+            disparity.parent,
+            missing[0] if len(missing) == 1 else f"{missing[0]} or one with another ending",
+        )
+        raise ValueError(f"{folder} holds {disparity.name} and one view, but not the other: no {names}")
     return None
 
 
@@ -148,3 +235,16 @@ def check_gt_scale(gt_scale: float | None) -> None:
     """
     if gt_scale is not None and not 0 < gt_scale < float("inf"):
         raise ValueError(f"gt_scale (--gt-scale) must be positive and finite, got {gt_scale}")
+
+
+def check_sample_bits(sample_bits: int | None) -> None:
+    """Raise unless ``sample_bits`` is None or an integer from 8 to 16.
+
+    >>> check_sample_bits(12)
+    """
+    if sample_bits is None:
+        return
+    if isinstance(sample_bits, bool) or not isinstance(sample_bits, (int, SupportsIndex)):
+        raise TypeError(f"sample_bits must be an integer or None, got {sample_bits!r}")
+    if sample_bits not in SAMPLE_BITS:
+        raise LimitError(f"sample_bits must {SAMPLE_BITS}, got {sample_bits}")

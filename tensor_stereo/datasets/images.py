@@ -1,8 +1,8 @@
-"""Images, integer disparity maps and occlusion masks, decoded by OpenCV."""
+"""Images, integer disparity maps and occlusion masks as tensors and arrays."""
 
 from __future__ import annotations
 
-import zlib
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,42 +12,79 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tensor_stereo.datasets.files import StrPath, check_gt_scale
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+from tensor_stereo.datasets.decoding import decode
+from tensor_stereo.datasets.files import StrPath, check_gt_scale, check_sample_bits
 
 # mask0nocc.png of MiddEval3 and ETH3D
 UNKNOWN, OCCLUDED, VISIBLE = 0, 128, 255
 
 
-def read_image(path: StrPath) -> Tensor:
+_DARK = 2**14  # samples of 16 bits that stay below it probably have 14 bits or fewer
+
+
+class SampleRangeWarning(UserWarning):
+    """A file stores dark samples of 16 bits and does not say how many of these bits are in use."""
+
+
+def read_image(path: StrPath, *, sample_bits: int | None = None) -> Tensor:
     """Read an image as it is stored, without the rotation that its metadata may ask for.
 
-    Palettes are expanded and an alpha channel is dropped. 16 bits become 8 by rounding value / 257, which takes 65535
-    to 255 and 257 times an 8-bit value back to it.
+    Palettes are expanded and an alpha channel is dropped. The result has 8 bits: a sample v becomes v * 255 / largest,
+    rounded to the nearest whole number, half up. The file tells ``largest``: maxval of a PGM or PPM; the bits of a
+    TIFF, or its MaxSampleValue if that is 1023, 4095 or another 2**n - 1; the chunk sBIT of a PNG of 16 bits, whose
+    scaling by left shift or bit replication is undone, and whose samples are taken as they are if they were not scaled.
+    Other samples of 8 bits stay unchanged, and other samples of 16 bits have ``largest`` = 65535.
 
     Args:
-        path: any format that OpenCV reads (PNG, PPM, PGM, JPEG, TIFF, ...).
+        path: The file, in any format that OpenCV reads (PNG, PPM, PGM, JPEG, TIFF, WebP, BMP, ...).
+        sample_bits: Bits in use, 8 to 16, of samples that are stored in 16 bits, where the file does not tell it (nor
+            says maxval 65535): ``largest`` = 2**sample_bits - 1. Other files are read as without it.
 
     Returns:
         (C, H, W) uint8; C = 1 for grey, 3 for colour in the order RGB.
 
+    Warns:
+        SampleRangeWarning: if nothing tells the range of samples of 16 bits and the largest one is below 2**14.
+
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is empty, damaged, no image, or holds other than 8 or 16 bits per channel.
+        TypeError: if ``sample_bits`` is no integer.
+        ValueError: if ``sample_bits`` lies outside of its limits; if the file is empty, truncated, damaged, no image,
+            holds other than 8 or 16 bits per channel, or a sample above its range.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = Path(folder, "im0.ppm").write_bytes(b"P6 1 1 255 " + bytes([10, 20, 30]))
+    ...     _ = Path(folder, "im0.ppm").write_bytes(b"P6 1 1 100 " + bytes([0, 20, 100]))
     ...     read_image(f"{folder}/im0.ppm").flatten()
-    tensor([10, 20, 30], dtype=torch.uint8)
+    tensor([  0,  51, 255], dtype=torch.uint8)
     """
-    pixels = _decode(path)
-    if pixels.dtype == np.uint16:
-        pixels = (pixels.astype(np.uint32) + 128) // 257
-    elif pixels.dtype != np.uint8:
-        raise ValueError(f"{path} must hold 8 or 16 bits per channel, got {pixels.dtype}")
-    channels = pixels[None] if pixels.ndim == 2 else pixels[..., 2::-1].transpose(2, 0, 1)  # BGR(A) -> RGB
+    check_sample_bits(sample_bits)
+    samples, largest, _ = decode(path).to_view()
+    if samples.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path} must hold 8 or 16 bits per channel, got {samples.dtype}")
+    samples = samples if samples.ndim == 2 else samples[..., :3]
+    brightest = int(samples.max())
+    if largest is None and sample_bits is not None:
+        largest = 2**sample_bits - 1
+        if brightest > largest:
+            raise ValueError(
+                f"{path} must hold samples of at most {largest} for sample_bits (--sample-bits) {sample_bits}, "
+                f"found {brightest}"
+            )
+    elif largest is None:
+        largest = 65535
+        if 0 < brightest < _DARK:
+            warnings.warn(
+                f"{path} holds samples of 16 bits, none above {brightest}, and does not tell their range; if fewer "
+                "bits are in use, the image is too dark: give sample_bits (--sample-bits)",
+                SampleRangeWarning,
+                stacklevel=2,
+            )
+    if brightest > largest:
+        raise ValueError(f"{path} must hold samples of at most {largest}, as it says itself, found {brightest}")
+    if largest != 255:
+        samples = (samples.astype(np.uint32) * 510 + largest) // (2 * largest)
+    channels = samples[None] if samples.ndim == 2 else samples.transpose(2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(channels, dtype=np.uint8))
 
 
@@ -68,7 +105,7 @@ def write_image(path: StrPath, image: Tensor) -> None:
     tensor([[[1, 2]]], dtype=torch.uint8)
     """
     pixels = image.numpy(force=True).transpose(1, 2, 0)[..., ::-1]  # RGB -> BGR
-    encoded = cv2.imencode(Path(path).suffix, np.ascontiguousarray(pixels))[1]
+    encoded = cv2.imencode(Path(path).suffix.casefold(), np.ascontiguousarray(pixels))[1]
     Path(path).write_bytes(encoded.tobytes())
 
 
@@ -131,6 +168,20 @@ def read_occlusion_mask(path: StrPath) -> NDArray[np.bool_]:
     return occluded
 
 
+def read_nonzero_mask(path: StrPath) -> NDArray[np.bool_]:
+    """Read a mask that is not 0 where a pixel is occluded, as of FlyingThings3D's subset.
+
+    Returns:
+        (H, W) bool.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is empty, damaged or coloured.
+    """
+    occluded: NDArray[np.bool_] = _decode_grey(path) != 0
+    return occluded
+
+
 def read_sintel_disparity(path: StrPath) -> NDArray[np.float32]:
     """Read a disparity map of Sintel stereo: 4 R + G / 64 px in an 8-bit RGB image, known everywhere to 1/64 px.
 
@@ -141,10 +192,10 @@ def read_sintel_disparity(path: StrPath) -> NDArray[np.float32]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is empty, damaged, or no 8-bit colour image.
     """
-    pixels = _decode(path)
+    pixels = decode(path).samples
     if pixels.ndim != 3 or pixels.dtype != np.uint8:
         raise ValueError(f"{path} must be an 8-bit RGB image, got {pixels.dtype} of shape {pixels.shape}")
-    red, green = pixels[..., 2].astype(np.float32), pixels[..., 1].astype(np.float32)  # decoded as BGR
+    red, green = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
     return (4 * red + green / 64).astype(np.float32)
 
 
@@ -160,7 +211,7 @@ def read_sintel_occlusion(path: StrPath) -> NDArray[np.bool_]:
     """
     path = Path(path)
     beside = path.parents[2] / "outofframe" / path.parent.name / path.name
-    maps = [_decode(file) for file in (path, beside) if file == path or file.is_file()]
+    maps = [decode(file).samples for file in (path, beside) if file == path or file.is_file()]
     for file, values in zip((path, beside), maps, strict=False):
         if values.shape != maps[0].shape or values.ndim != 2:
             raise ValueError(f"{file} must be a map (H, W) of one channel, got shape {values.shape}")
@@ -169,45 +220,10 @@ def read_sintel_occlusion(path: StrPath) -> NDArray[np.bool_]:
 
 
 def _decode_grey(path: StrPath) -> NDArray[Any]:
-    """(H, W) stored values of a one-channel image."""
-    pixels = _decode(path)
-    if pixels.ndim == 2:
-        return pixels
-    if (pixels[..., :3] != pixels[..., :1]).any():
-        raise ValueError(f"{path} must be grey, got an image with {pixels.shape[2]} different channels")
-    return np.ascontiguousarray(pixels[..., 0])
-
-
-def _decode(path: StrPath) -> NDArray[Any]:
-    """(H, W) or (H, W, C) stored values, channels as BGR or BGRA."""
-    # imread answers None to a missing and to a damaged file alike, and takes only ASCII paths on some systems
-    content = Path(path).read_bytes()
-    if not content:
-        raise ValueError(f"{path} is empty (0 bytes), expected an image")
-    if content.startswith(PNG_SIGNATURE) and not _is_whole_png(content):
-        raise ValueError(f"{path} cannot be decoded as an image: the PNG file is truncated or damaged")
-    encoded = np.frombuffer(content, dtype=np.uint8)
-    try:
-        pixels: NDArray[Any] | None = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise ValueError(f"{path} cannot be decoded as an image: {error}") from error
-    if pixels is None:
-        raise ValueError(f"{path} cannot be decoded as an image: the format is unknown or the file is damaged")
-    return pixels
-
-
-def _is_whole_png(content: bytes) -> bool:
-    """Whether all chunks are there and match their checksums; libpng would print its own complaint otherwise.
-
-    Source: PNG specification, 3rd edition, section 5.3.
-    """
-    start = len(PNG_SIGNATURE)
-    while start + 12 <= len(content):
-        length = int.from_bytes(content[start : start + 4])
-        stop = start + 8 + length
-        if zlib.crc32(memoryview(content)[start + 4 : stop]) != int.from_bytes(content[stop : stop + 4]):
-            return False
-        if content[start + 4 : start + 8] == b"IEND":
-            return True
-        start = stop + 4
-    return False
+    """(H, W) stored values of a one-channel image, whatever their range."""
+    samples = decode(path).samples
+    if samples.ndim == 2:
+        return samples
+    if (samples[..., :3] != samples[..., :1]).any():
+        raise ValueError(f"{path} must be grey, got an image with {samples.shape[2]} different channels")
+    return np.ascontiguousarray(samples[..., 0])

@@ -1,13 +1,24 @@
-"""KITTI's stereo benchmarks of 2012 (Geiger et al. 2012) and 2015 (Menze & Geiger 2015), https://www.cvlibs.net/datasets/kitti/."""
+"""KITTI's stereo benchmarks of 2012 (Geiger et al.) and 2015 (Menze & Geiger), and its sequences without truth.
+
+Sources: https://www.cvlibs.net/datasets/kitti/ and the development kits of raw data, odometry and object detection.
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
-from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, parent_names
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, list_files, pair_frames, parent_names
 
 _SCALE = 256.0  # of the 16-bit maps, in both releases
+
+
+_BENCHMARK = re.compile(r".*_10")  # the frame of a scene that has ground truth
+_SEQUENCE = re.compile(r"\d{6}")  # a frame of odometry or of object detection
+_DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync")
+_CAMERAS = (("image_2", "image_3"), ("image_0", "image_1"))  # colour before grey
+_RAW_CAMERAS = (("image_02", "image_03"), ("image_00", "image_01"))
 
 
 class _Layout(NamedTuple):
@@ -28,15 +39,21 @@ _LAYOUTS = (
 def find_kitti(root: StrPath) -> list[PairFiles]:
     """Find KITTI's stereo pairs in ``root`` and below; no image is opened.
 
-    Only the frames ``*_10.png`` are taken, the ones that have ground truth. Where 2012 is there in colour and in grey,
-    colour is taken. The frames of a folder ``testing`` get a dataset name of their own (``kitti-2015-testing``), since
-    they share their numbers with those of ``training``.
+    Of the benchmarks only the frames ``*_10`` are taken, the ones that have ground truth. Where 2012 is there in colour
+    and in grey, colour is taken. The frames of a folder ``testing`` get a dataset name of their own
+    (``kitti-2015-testing``), since they share their numbers with those of ``training``. Where the map of visible pixels
+    ``disp_noc`` is the only one, it is the ground truth, and nothing tells the occluded pixels.
+
+    Raw data (``kitti-raw``), odometry (``kitti-odometry``) and object detection (``kitti-object``) give pairs without
+    ground truth, in colour if that is there. Of raw data only folders ``*_sync`` are taken: those named ``*_extract``
+    hold images that are not rectified.
 
     Args:
-        root: a folder with releases, one release, or its folder ``training``.
+        root: a folder with releases, one release, its folder ``training``, or one sequence.
 
     Returns:
-        Pairs sorted by (dataset, frame); 16-bit disparity maps with ``gt_scale`` 256, None where withheld.
+        Pairs sorted by (dataset, frame); 16-bit disparity maps with ``gt_scale`` 256, None where withheld. The scene of
+        a sequence is its folder and the frame, ``00/000012``.
 
     Raises:
         FileNotFoundError, NotADirectoryError: if ``root`` is no folder.
@@ -61,24 +78,43 @@ def kitti_pairs(folder: Path) -> list[PairFiles]:
     []
     """
     pairs: dict[tuple[str, str], PairFiles] = {}
-    ending = "-testing" if parent_names(folder)[0].casefold() == "testing" else ""
+    name = parent_names(folder)[0]
+    ending = "-testing" if name.casefold() == "testing" else ""
     for layout in _LAYOUTS:
-        if not (folder / layout.image0).is_dir() or not (folder / layout.image1).is_dir():
-            continue
-        for image0 in sorted((folder / layout.image0).glob("*_10.png")):
-            image1 = folder / layout.image1 / image0.name
-            if not image1.is_file():
-                raise ValueError(f"{image0} has no right view: {image1} is missing")
-            disparity, noc = (folder / name / image0.name for name in (layout.disparity_gt, layout.disparity_noc_gt))
-            has_disparity = disparity.is_file()
+        frames = _frames(folder / layout.image0, folder / layout.image1, _BENCHMARK)
+        maps, maps_noc = (list_files(folder / part) if frames else {} for part in layout[3:])
+        for stem, image0, image1 in frames:
+            file = f"{stem}.png".casefold()
+            disparity, noc = maps.get(file), maps_noc.get(file)
+            has_disparity = disparity is not None or noc is not None
             pair = PairFiles(
                 dataset=layout.dataset + ending,
-                scene=image0.stem,
+                scene=stem,
                 image0=image0,
                 image1=image1,
-                disparity_gt=disparity if has_disparity else None,
+                disparity_gt=noc if disparity is None else disparity,
                 gt_scale=_SCALE if has_disparity else None,
-                disparity_noc_gt=noc if has_disparity and noc.is_file() else None,
+                disparity_noc_gt=None if disparity is None else noc,
             )
             pairs.setdefault((pair.dataset, pair.scene), pair)
-    return list(pairs.values())
+    return list(pairs.values()) or _sequence_pairs(folder, name)
+
+
+def _sequence_pairs(folder: Path, name: str) -> list[PairFiles]:
+    """The pairs of one sequence, or of one part of the benchmark of object detection."""
+    if _DRIVE.fullmatch(name):
+        dataset, pattern = "kitti-raw", re.compile(r"\d{10}")
+        cameras = [(f"{left}/data", f"{right}/data") for left, right in _RAW_CAMERAS]
+    else:
+        dataset, pattern = ("kitti-object" if name in ("training", "testing") else "kitti-odometry"), _SEQUENCE
+        cameras = list(_CAMERAS)
+    for left, right in cameras:
+        frames = _frames(folder / left, folder / right, pattern)
+        if frames:
+            return [PairFiles(dataset, f"{name}/{stem}", image0, image1) for stem, image0, image1 in frames]
+    return []
+
+
+def _frames(left: Path, right: Path, pattern: re.Pattern[str]) -> list[tuple[str, Path, Path]]:
+    """The frames of both folders whose names are those of a release; none if there is only one folder."""
+    return pair_frames(left, right, pattern) if left.is_dir() and right.is_dir() else []

@@ -5,13 +5,21 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
 
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.datasets.discovery import find_pairs
-from tensor_stereo.datasets.files import GT_ENCODINGS, PairFiles, StrPath, check_gt_scale
+from tensor_stereo.datasets.files import (
+    GT_ENCODINGS,
+    SAMPLE_BITS,
+    PairFiles,
+    StrPath,
+    check_gt_scale,
+    check_sample_bits,
+)
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.paths import check_ending, has_ending
 from tensor_stereo.table_files import read_csv, read_parquet, write_table
@@ -25,22 +33,29 @@ SCHEMA = {
     "gt_encoding": pl.String,  # scaled, or sintel: how the maps hold their values
     "width_px": pl.Int32,  # of image0
     "height_px": pl.Int32,
+    "sample_bits": pl.Int32,  # in use, of views that store 16 bits and do not tell; null: nothing says so
 }
+_OPTIONAL = ("sample_bits",)  # not there in manifests of earlier releases
 _REQUIRED = ("dataset", "scene", "image0", "image1", "gt_encoding", "width_px", "height_px")
 _LISTED = ("image0", "image1")  # what a CSV of paths must have
 
 
-def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -> pl.DataFrame:
+def build_manifest(
+    roots: Sequence[StrPath], *, gt_scale: float | None = None, sample_bits: int | None = None
+) -> pl.DataFrame:
     r"""Find the pairs of folders and lists of paths; only headers of images are read.
 
     A list is a CSV file with the columns ``image0`` and ``image1`` and any of ``disparity_gt``, ``gt_scale``,
-    ``gt_encoding``, ``disparity_noc_gt``, ``mask``, ``calibration``, ``dataset`` (default: the file's name) and
-    ``scene`` (default: the name of ``image0`` without ending). Its paths are absolute or relative to its own folder.
+    ``gt_encoding``, ``disparity_noc_gt``, ``mask``, ``calibration``, ``sample_bits``, ``dataset`` (default: the file's
+    name) and ``scene`` (default: the name of ``image0`` without ending). Its paths are absolute or relative to its own
+    folder. Blanks around values do not count.
 
     Args:
         roots: folders as :func:`~tensor_stereo.datasets.find_pairs` takes them, and ``.csv`` files. A pair that lies
             below several of them is taken once.
         gt_scale: as in :func:`~tensor_stereo.datasets.find_pairs`, for the folders.
+        sample_bits: as in :func:`~tensor_stereo.datasets.find_pairs`, for the folders and for the pairs of lists that
+            do not give it.
 
     Returns:
         One row per pair with the columns of ``SCHEMA``, sorted by (dataset, scene without case).
@@ -62,10 +77,13 @@ def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -
         raise TypeError(f"roots must be a sequence of paths, got the single path {os.fspath(roots)!r}")
     if not roots:
         raise ValueError("roots must name at least one folder or CSV file")
+    check_sample_bits(sample_bits)
     found: dict[tuple[Path, Path], PairFiles] = {}
     for root in map(Path, roots):
         is_list = has_ending(root, ".csv") and not root.is_dir()
         for pair in _read_list(root) if is_list else find_pairs(root, gt_scale=gt_scale):
+            if pair.sample_bits is None and sample_bits is not None:
+                pair = replace(pair, sample_bits=int(sample_bits))
             found.setdefault((pair.image0.resolve(), pair.image1.resolve()), pair)
     pairs = sorted(found.values(), key=lambda pair: (pair.dataset, pair.scene.casefold()))
     _check_names(pairs)
@@ -82,6 +100,7 @@ def build_manifest(roots: Sequence[StrPath], *, gt_scale: float | None = None) -
                 "gt_encoding": pair.gt_encoding,
                 "width_px": width,
                 "height_px": height,
+                "sample_bits": pair.sample_bits,
             }
         )
     return pl.DataFrame(rows, schema=SCHEMA)
@@ -119,6 +138,8 @@ def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]
     if not path.is_file():
         raise FileNotFoundError(f"there is no manifest {path}")
     table = read_parquet(path)
+    missing = [name for name in _OPTIONAL if name not in table.columns]
+    table = table.with_columns(pl.lit(None, dtype=SCHEMA[name]).alias(name) for name in missing)
     for name, dtype in SCHEMA.items():
         if name not in table.columns:
             raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
@@ -143,6 +164,9 @@ def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool)
     scale = values["gt_scale"]
     if scale is not None and not (isinstance(scale, float) and 0 < scale < math.inf):
         raise ValueError(f"{path}, row {row + 1}: column 'gt_scale' must be positive and finite, got {scale}")
+    bits = values["sample_bits"]
+    if bits is not None and bits not in SAMPLE_BITS:  # type: ignore[operator]
+        raise ValueError(f"{path}, row {row + 1}: column 'sample_bits' must {SAMPLE_BITS}, got {bits}")
     encoding = str(values["gt_encoding"])
     if encoding not in GT_ENCODINGS:
         raise ValueError(f"{path}, row {row + 1}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}")
@@ -150,14 +174,21 @@ def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool)
     for name, file in paths.items():
         if check_files and file is not None and not file.is_file():
             raise ValueError(f"{path}, row {row + 1}: column {name!r} names {file}, which is no file")
-    return PairFiles(str(values["dataset"]), str(values["scene"]), gt_scale=scale, gt_encoding=encoding, **paths)  # type: ignore[arg-type]
+    return PairFiles(
+        str(values["dataset"]),
+        str(values["scene"]),
+        gt_scale=scale,
+        gt_encoding=encoding,
+        sample_bits=bits,  # type: ignore[arg-type]
+        **paths,  # type: ignore[arg-type]
+    )
 
 
 def _read_list(path: Path) -> list[PairFiles]:
     """The pairs of a CSV of paths."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no list of pairs {path}")
-    table = read_csv(path)
+    table = read_csv(path).with_columns(pl.all().str.strip_chars())
     for name in _LISTED:
         if name not in table.columns:
             raise ValueError(f"{path} has no column {name!r}, it has {table.columns}")
@@ -178,6 +209,11 @@ def _read_list(path: Path) -> list[PairFiles]:
             check_gt_scale(scale)
         except ValueError as error:
             raise ValueError(f"{path}, line {row + 2}: column 'gt_scale': {error}") from error
+        try:
+            bits = _whole(values["sample_bits"]) if values.get("sample_bits") else None
+            check_sample_bits(bits)
+        except ValueError as error:
+            raise ValueError(f"{path}, line {row + 2}: column 'sample_bits': {error}") from error
         encoding = values.get("gt_encoding") or "scaled"
         if encoding not in GT_ENCODINGS:
             raise ValueError(
@@ -187,8 +223,16 @@ def _read_list(path: Path) -> list[PairFiles]:
         if disparity is not None and scale is None and encoding == "scaled" and not has_ending(disparity, ".pfm"):
             raise ValueError(f"{path}, line {row + 2}: column 'gt_scale' is empty, but {disparity} is no PFM file")
         dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
-        pairs.append(PairFiles(dataset, scene, gt_scale=scale, gt_encoding=encoding, **paths))
+        pairs.append(PairFiles(dataset, scene, gt_scale=scale, gt_encoding=encoding, sample_bits=bits, **paths))
     return pairs
+
+
+def _whole(text: str) -> int:
+    """A whole number, which some programs write as 12.0."""
+    number = float(text)
+    if not number.is_integer():
+        raise ValueError(f"must be a whole number, got {text!r}")
+    return int(number)
 
 
 def _check_names(pairs: Sequence[PairFiles]) -> None:

@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tensor_stereo.datasets.eth3d import is_eth3d_scene
-from tensor_stereo.datasets.files import PairFiles, StrPath, Views, collect_pairs, find_file, find_views, parent_names
+from tensor_stereo.datasets.files import (
+    PairFiles,
+    StrPath,
+    Views,
+    collect_pairs,
+    find_file,
+    find_views,
+    image_names,
+    list_files,
+    parent_names,
+)
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.datasets.middlebury_scales import find_release, folder_year, integer_scale
 
@@ -32,14 +42,12 @@ class _Layout(NamedTuple):
 
 
 def _integer_layout(image0: str, image1: str, disparity_gt: str, years: Sequence[str]) -> _Layout:
-    names0, names1, names_gt = (
-        [stem + end for end in (".png", ".ppm", ".pgm")] for stem in (image0, image1, disparity_gt)
-    )
-    return _Layout(names0, names1, names_gt, years)
+    names_gt = [disparity_gt + ending for ending in (".png", ".ppm", ".pgm")]
+    return _Layout(image_names(image0), image_names(image1), names_gt, years)
 
 
 _LAYOUTS = (
-    _Layout(["im0.png"], ["im1.png"], ["disp0GT.pfm", "disp0.pfm"], ()),
+    _Layout(image_names("im0"), image_names("im1"), ["disp0GT.pfm", "disp0.pfm"], ()),
     _integer_layout("view1", "view5", "disp1", ("2005", "2006")),
     _integer_layout("im2", "im6", "disp2", ("2001", "2003")),  # before im0, im1: archives of nine views hold im0 to im8
     _integer_layout("scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", ("2001",)),  # tsukuba
@@ -63,10 +71,11 @@ def find_middlebury(root: StrPath) -> list[PairFiles]:
                             mask0nocc.png
     ======================  ==================================  ===============================================
 
-    Images and 8-bit maps may be PNG, PPM or PGM. For 2001-2006 ``gt_scale`` is settled by the release (a folder above
-    the scene named for it, as ``2003``, ``scenes2005`` or ``middlebury-2006``, else the scene's name) and the size (a
-    folder as ``HalfSize``, a name as ``conesH``, else the width of view 0); it is None where these leave it open or
-    disagree. Scenes without a disparity map are listed with ``disparity_gt=None``.
+    Images may have any ending of images (PNG, PPM, PGM, TIFF, BMP, WebP, JPEG), 8-bit maps may be PNG, PPM or PGM.
+    For 2001-2006 ``gt_scale`` is settled by the release (a folder above the scene named for it, as ``2003``,
+    ``scenes2005`` or ``middlebury-2006``, else the scene's name) and the size (a folder as ``HalfSize``, a name as
+    ``conesH``, else the width of view 0); it is None where these leave it open or disagree. Scenes without a
+    disparity map are listed with ``disparity_gt=None``.
 
     Args:
         root: a folder with releases, one release, or one scene's folder.
@@ -97,7 +106,8 @@ def middlebury_pairs(folder: Path) -> list[PairFiles]:
     >>> middlebury_pairs(Path("no/such/folder"))
     []
     """
-    present = [(layout, views) for layout in _LAYOUTS if (views := find_views(folder, *layout[:3])) is not None]
+    files = list_files(folder)
+    present = [(layout, views) for layout in _LAYOUTS if (views := find_views(files, *layout[:3])) is not None]
     if not present:
         return []
     layout, views = next(((layout, views) for layout, views in present if views.disparity_gt is not None), present[0])
@@ -117,8 +127,8 @@ def middlebury_pairs(folder: Path) -> list[PairFiles]:
             scene,
             *views,
             gt_scale=None if views.disparity_gt is None else 1.0,
-            mask=find_file(folder, ["mask0nocc.png"]),
-            calibration=find_file(folder, ["calib.txt"]),
+            mask=find_file(files, ["mask0nocc.png"]),
+            calibration=find_file(files, ["calib.txt"]),
         )
     ]
 
@@ -131,7 +141,7 @@ def _float_release(folder: Path, scene: str, disparity: Path | None) -> str:
         year = folder_year(name, years=("2014", "2021"))
         if year is not None:
             return f"middlebury-{year}"
-    if disparity is not None and disparity.name == "disp0GT.pfm":
+    if disparity is not None and disparity.name.casefold() == "disp0gt.pfm":
         return "middeval3"
     if _SCENES_2014.fullmatch(scene):
         return "middlebury-2014"

@@ -17,6 +17,7 @@ from tensor_stereo.datasets.files import PairFiles, check_gt_scale, missing_scal
 from tensor_stereo.datasets.images import (
     read_disparity_png,
     read_image,
+    read_nonzero_mask,
     read_occlusion_mask,
     read_sintel_disparity,
     read_sintel_occlusion,
@@ -29,15 +30,18 @@ from tensor_stereo.types import StereoPair
 def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
     """Read one pair.
 
+    Of a grey view beside a view in colour, the one channel is repeated.
+
     Args:
         files: as found by :func:`~tensor_stereo.datasets.discovery.find_pairs`.
         gt_scale: replaces ``files.gt_scale``: stored value / gt_scale = disparity in px.
 
     Returns:
         The pair on the CPU. ``disparity_gt`` is NaN where the release does not know it (0 in integer maps, infinite in
-        float maps). ``occluded`` comes from the release: its mask, or the pixels that KITTI's map of visible pixels
-        leaves out; it is False where ground truth is unknown, and None for releases without it (Middlebury's but
-        MiddEval3).
+        float maps). The maps of FlyingThings3D's subset are negative in the left view; a map whose known values have a
+        negative sum is negated. ``occluded`` comes from the release: its mask, or the pixels that KITTI's map of
+        visible pixels leaves out; it is False where ground truth is unknown, and None for releases without it
+        (Middlebury's but MiddEval3).
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -52,7 +56,9 @@ def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
     tensor([[nan, 2.]])
     """
     check_gt_scale(gt_scale)
-    image0, image1 = read_image(files.image0), read_image(files.image1)
+    image0, image1 = (read_image(path, sample_bits=files.sample_bits) for path in (files.image0, files.image1))
+    channels = max(len(image0), len(image1))
+    image0, image1 = (image.expand(channels, -1, -1).contiguous() for image in (image0, image1))
     if image0.shape != image1.shape:
         shapes = f"{files.image0} has {tuple(image0.shape)}, {files.image1} has {tuple(image1.shape)}"
         raise ValueError(f"both views must have one shape (C, H, W): {shapes}")
@@ -115,6 +121,8 @@ def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> Flo
         raise ValueError(f"{path} must have one channel (Pf), got shape {stored.shape}")
     disparity = stored / np.float32(1.0 if scale is None else scale)
     disparity[~np.isfinite(disparity)] = np.nan
+    if files.gt_encoding == "flyingthings3d-subset" and np.nansum(disparity, dtype=np.float64) < 0:
+        disparity = -disparity
     return disparity
 
 
@@ -122,6 +130,8 @@ def _read_occluded(files: PairFiles, disparity: FloatMap, gt_scale: float | None
     """(H, W) bool from whatever the release tells of occlusion, None if it is silent."""
     if files.mask is not None and files.gt_encoding == "sintel":
         return read_sintel_occlusion(files.mask)
+    if files.mask is not None and files.gt_encoding == "flyingthings3d-subset":
+        return read_nonzero_mask(files.mask) & np.isfinite(disparity)
     if files.mask is not None:
         return read_occlusion_mask(files.mask)
     if files.disparity_noc_gt is None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
-from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs
+from tensor_stereo.datasets.files import PairFiles, StrPath, collect_pairs, list_files, pair_frames
 
 _PASSES = ("clean", "final")
+_FRAME = re.compile(r"frame_.*")
 
 
 def find_sintel(root: StrPath) -> list[PairFiles]:
@@ -44,21 +46,20 @@ def sintel_pairs(folder: Path) -> list[PairFiles]:
     pairs = []
     for kind in _PASSES:
         left, right = folder / f"{kind}_left", folder / f"{kind}_right"
-        for image0 in sorted(left.glob("*/frame_*.png")) if right.is_dir() else ():
-            inner = image0.relative_to(left)
-            if not (right / inner).is_file():
-                raise ValueError(f"{image0} has no right view: {right / inner} is missing")
-            disparity, mask = (folder / name / inner for name in ("disparities", "occlusions"))
-            pairs.append(
-                PairFiles(
-                    dataset=f"sintel-{kind}",
-                    scene=inner.with_suffix("").as_posix(),
-                    image0=image0,
-                    image1=right / inner,
-                    disparity_gt=disparity if disparity.is_file() else None,
-                    gt_scale=1.0 if disparity.is_file() else None,
-                    mask=mask if mask.is_file() else None,
-                    gt_encoding="sintel",
+        for scene in sorted(left.iterdir()) if left.is_dir() and right.is_dir() else ():
+            maps, masks = (list_files(folder / name / scene.name) for name in ("disparities", "occlusions"))
+            for stem, image0, image1 in pair_frames(scene, right / scene.name, _FRAME):
+                disparity = maps.get(f"{stem}.png".casefold())
+                pairs.append(
+                    PairFiles(
+                        dataset=f"sintel-{kind}",
+                        scene=f"{scene.name}/{stem}",
+                        image0=image0,
+                        image1=image1,
+                        disparity_gt=disparity,
+                        gt_scale=None if disparity is None else 1.0,
+                        mask=masks.get(f"{stem}.png".casefold()),
+                        gt_encoding="sintel",
+                    )
                 )
-            )
     return pairs

@@ -14,7 +14,7 @@ from tensor_stereo.classification import verdicts_by_name
 from tensor_stereo.configs import PipelineConfig, describe_settings
 from tensor_stereo.datasets import PairFiles, read_pair
 from tensor_stereo.datasets.discovery import find_scale
-from tensor_stereo.datasets.files import check_gt_scale
+from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
 from tensor_stereo.evaluation.metrics import Rates, match_rates, matches_against_gt
 from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
@@ -57,6 +57,7 @@ def classify_files(
     *,
     disparity_gt: Path | str | None = None,
     gt_scale: float | None = None,
+    sample_bits: int | None = None,
     out: Path | str | None = None,
     figure: Path | str | None = None,
 ) -> MatchSummary:
@@ -68,6 +69,7 @@ def classify_files(
         config: Settings of every step; None means the defaults.
         disparity_gt: Ground truth of view 0, PFM or PNG.
         gt_scale: Stored value / px of disparity in a PNG map; None: the one of the release, if its folders tell it.
+        sample_bits: Bits in use, 8 to 16, of views that store 16 bits per sample and do not tell.
         out: File .csv or .parquet for :func:`match_table`.
         figure: File .png for both views, their matches by every verdict that decides, and their graphs.
 
@@ -87,11 +89,12 @@ def classify_files(
             check_apart(name, path, {"left": left, "right": right, "disparity_gt": disparity_gt})
             prepare_target(name, path, endings)
     check_gt_scale(gt_scale)
+    check_sample_bits(sample_bits)
     if gt_scale is not None and (disparity_gt is None or has_ending(disparity_gt, ".pfm")):
         raise ValueError(f"gt_scale must be None without disparity_gt in a PNG file, got {gt_scale}")
     if disparity_gt is not None and gt_scale is None:
         gt_scale = find_scale(left, disparity_gt)
-    pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale))
+    pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale, sample_bits=sample_bits))
     output = run_pipeline([(pair.image0, pair.image1)], config)
     truth = None if pair.disparity_gt is None else matches_against_gt(output.matches, [pair.disparity_gt])
     if out is not None:

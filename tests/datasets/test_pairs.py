@@ -183,7 +183,7 @@ def test_kitti_pixels_known_but_not_among_the_visible_are_occluded(files, tmp_pa
         read_pair(replace(files, disparity_gt=tmp_path / "occ.png", gt_scale=256.0, disparity_noc_gt=noc))
 
 
-@pytest.mark.parametrize("shape", [(3, 5, 3), (4, 4, 3), (3, 4)])
+@pytest.mark.parametrize("shape", [(3, 5, 3), (4, 4, 3), (3, 5)])
 def test_views_of_different_shape_are_named(files, shape):
     cv2.imwrite(str(files.image1), np.zeros(shape, dtype=np.uint8))
     with pytest.raises(ValueError, match=r"view1\.png has \(3, 3, 4\), .*view5\.png has"):
@@ -220,3 +220,45 @@ def test_dataset_feeds_a_data_loader(files):
     dataset = pickle.loads(pickle.dumps(PairDataset([replace(files, scene=name) for name in scenes], gt_scale=3)))
     batches = [[pair.name for pair in batch] for batch in DataLoader(dataset, batch_size=2, collate_fn=list)]
     assert batches == [["chair", "table"], ["lamp"]]
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_grey_view_beside_a_colour_one_is_repeated(files, view):
+    path = (files.image0, files.image1)[view]
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    cv2.imwrite(str(path), grey)
+    pair = read_pair(replace(files, disparity_gt=None))
+    repeated, coloured = (pair.image0, pair.image1)[:: 1 if view == 0 else -1]
+    assert repeated.tolist() == [grey.tolist()] * 3
+    assert repeated.is_contiguous()
+    assert coloured.shape == (3, 3, 4)
+    assert len(coloured.unique(dim=0)) == 3  # in colour still
+
+
+def test_two_grey_views_stay_grey(files):
+    for path in (files.image0, files.image1):
+        cv2.imwrite(str(path), np.zeros((3, 4), np.uint8))
+    assert read_pair(replace(files, disparity_gt=None)).image0.shape == (1, 3, 4)
+
+
+def test_bits_of_a_pair_reach_both_views(files):
+    for path in (files.image0, files.image1):
+        cv2.imwrite(str(path), np.full((3, 4), 4095, np.uint16))
+    pair = read_pair(replace(files, disparity_gt=None, sample_bits=12))
+    assert (pair.image0 == 255).all()
+    assert (pair.image1 == 255).all()
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_maps_of_the_flyingthings3d_subset_are_read_with_either_sign(files, tmp_path, sign):
+    write_pfm(tmp_path / "0000000.pfm", np.full((3, 4), sign * 2.5, np.float32))
+    cv2.imwrite(str(tmp_path / "0000000.png"), np.array([[0, 255, 1, 0]] * 3, dtype=np.uint8))
+    changes = {"disparity_gt": tmp_path / "0000000.pfm", "mask": tmp_path / "0000000.png", "gt_scale": 1.0}
+    pair = read_pair(replace(files, gt_encoding="flyingthings3d-subset", **changes))
+    assert (pair.disparity_gt == 2.5).all()
+    assert pair.occluded.tolist() == [[False, True, True, False]] * 3
+
+
+def test_negative_maps_of_other_data_sets_stay_negative(files, tmp_path):
+    write_pfm(tmp_path / "d.pfm", np.full((3, 4), -2.5, np.float32))
+    assert (read_pair(replace(files, disparity_gt=tmp_path / "d.pfm")).disparity_gt == -2.5).all()

@@ -294,3 +294,16 @@ def test_a_refused_state_changes_nothing() -> None:
     state["_extra_state"] = torch.zeros_like(state["_extra_state"])
     with pytest.raises(ValueError, match="no readable fingerprint"):
         module.load_state_dict(state)
+
+
+def test_a_grey_view_may_stand_beside_one_in_colour() -> None:
+    """As if its channel had been repeated, in the pipeline and in the module."""
+    matches, image0, image1 = rendered(2)
+    colour = torch.cat([image0, image0 // 2, image0 // 3])
+    repeated = image1.expand(3, -1, -1)
+    expected = ts.DelaunayFilter()(matches, images0=colour, images1=repeated).score
+    assert torch.equal(ts.DelaunayFilter()(matches, images0=colour, images1=image1).score, expected)
+    mixed, alike = (run_pipeline([(colour, view)]) for view in (image1, repeated))
+    assert mixed.matches.num_matches > 0
+    assert torch.equal(mixed.matches.keypoints1, alike.matches.keypoints1)
+    assert torch.equal(mixed.score, alike.score)

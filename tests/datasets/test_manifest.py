@@ -9,6 +9,7 @@ import pytest
 
 from tensor_stereo.datasets import find_pairs, read_pair, write_pfm
 from tensor_stereo.datasets.manifest import SCHEMA, build_manifest, read_manifest, write_manifest
+from tests.awkward_names import NAMES
 
 
 def _scene(folder: Path) -> None:
@@ -139,3 +140,72 @@ def test_a_name_says_nothing_of_the_encoding(tmp_path: Path) -> None:
     (tmp_path / "wrong.csv").write_text("image0,image1,gt_encoding\na.png,b.png,colour\n")
     with pytest.raises(ValueError, match=r"wrong\.csv, line 2: column 'gt_encoding'.*'colour'"):
         build_manifest([tmp_path / "wrong.csv"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_of_any_name_are_indexed_and_read(tmp_path: Path, name: str) -> None:
+    """In folders of a release and in lists, beside what the name would match if it were a pattern."""
+    values = {"view1.png": 10, "view5.png": 20}
+    scene, other = tmp_path / name / "2005" / name, tmp_path / "2005" / "run 1"
+    for folder, offset in ((scene, 0), (other, 100)):
+        folder.mkdir(parents=True)
+        for file, value in values.items():
+            cv2.imwrite(str(folder / file), np.full((4, 5), value + offset, np.uint8))
+    for ending, value in ((".a.png", 30), (".b.png", 40)):
+        (tmp_path / name / f"{name}{ending}").write_bytes(cv2.imencode(".png", np.full((4, 5), value, np.uint8))[1])
+    listed = pl.DataFrame({"image0": [f"{name}.a.png"], "image1": [f"{name}.b.png"], "dataset": ["listed"]})
+    path = tmp_path / name / f"{name}.csv"
+    with path.open("wb") as file:
+        listed.write_csv(file)
+    target = tmp_path / name / f"{name}.parquet"
+    write_manifest(build_manifest([tmp_path / name, path]), target)
+    found = {files.dataset: (files, read_pair(files)) for files in read_manifest(target)}
+    assert set(found) == {"middlebury-2005", "listed"}
+    assert found["middlebury-2005"][0].scene == name
+    assert found["listed"][0].scene == f"{name}.a"
+    for dataset, expected in (("middlebury-2005", (10, 20)), ("listed", (30, 40))):
+        pair = found[dataset][1]
+        assert (int(pair.image0[0, 0, 0]), int(pair.image1[0, 0, 0])) == expected
+
+
+@pytest.mark.parametrize("bits", ["12", " 12", "12.0", " 12.0 "])
+def test_blanks_and_decimals_in_a_list_do_not_count(tmp_path: Path, bits: str) -> None:
+    path = _list(
+        tmp_path,
+        "image0, image1 ,disparity_gt,gt_scale,gt_encoding,sample_bits,scene\n"
+        f" a.ppm ,b.ppm,\td.pgm, 8.0 , scaled,{bits}, one \n\n",
+    )
+    [row] = build_manifest([path]).rows(named=True)
+    assert (row["gt_scale"], row["gt_encoding"], row["sample_bits"], row["scene"]) == (8.0, "scaled", 12, "one")
+    assert row["image0"] == str((tmp_path / "a.ppm").resolve())
+
+
+@pytest.mark.parametrize("bits", ["7", "17", "12.5", "x", "nan", "inf"])
+def test_wrong_bits_in_a_list_name_file_line_and_column(tmp_path: Path, bits: str) -> None:
+    path = _list(tmp_path, f"image0,image1,sample_bits\na.ppm,b.ppm,{bits}\n")
+    with pytest.raises(ValueError, match=r"mine\.csv, line 2: column 'sample_bits'"):
+        build_manifest([path])
+
+
+def test_bits_of_samples_go_through_a_manifest(tmp_path: Path) -> None:
+    _scene(tmp_path / "2005" / "Art")
+    path = _list(tmp_path / "x", "image0,image1,sample_bits\na.ppm,b.ppm,10\nb.ppm,c.ppm,\n")
+    write_manifest(build_manifest([tmp_path / "2005", path], sample_bits=12), tmp_path / "m.parquet")
+    pairs = {pair.scene: pair.sample_bits for pair in read_manifest(tmp_path / "m.parquet")}
+    assert pairs == {"Art": 12, "a": 10, "b": 12}
+    with pytest.raises(ValueError, match="sample_bits must lie in"):
+        build_manifest([path], sample_bits=3)
+
+
+def test_a_manifest_of_before_has_no_bits(tmp_path: Path) -> None:
+    _scene(tmp_path / "2005" / "Art")
+    write_manifest(build_manifest([tmp_path]).drop("sample_bits"), tmp_path / "m.parquet")
+    assert read_manifest(tmp_path / "m.parquet") == find_pairs(tmp_path)
+
+
+def test_wrong_bits_in_a_manifest_name_row_and_column(tmp_path: Path) -> None:
+    _scene(tmp_path / "2005" / "Art")
+    manifest = build_manifest([tmp_path]).with_columns(pl.lit(33, dtype=pl.Int32).alias("sample_bits"))
+    write_manifest(manifest, tmp_path / "m.parquet")
+    with pytest.raises(ValueError, match=r"row 1: column 'sample_bits' must lie in \[8, 16\], got 33"):
+        read_manifest(tmp_path / "m.parquet")

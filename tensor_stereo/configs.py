@@ -224,12 +224,12 @@ def _check_cuts(config: FilterConfig) -> list[str]:
 class FileFilterConfig(FilterConfig):
     """What decides about the matches of a file, whose form can choose the verdict.
 
-    ``verdict=None`` stands for ``cardinality`` in files of hloc, COLMAP and LightGlue, whose pairs need not be
+    ``verdict=None`` stands for ``cardinality`` in files of other matchers, of hloc and COLMAP, whose pairs need not be
     rectified, and for ``score`` in all others.
     """
 
     verdict: Verdict | None = None  # type: ignore[assignment]
-    """what decides; None: the score, but cardinality in files of hloc, COLMAP and LightGlue"""
+    """what decides; None: the score, but cardinality in files of other matchers, .h5 and .db"""
 
     def __post_init__(self) -> None:
         if self.verdict is None:

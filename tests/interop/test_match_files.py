@@ -16,6 +16,7 @@ from tensor_stereo.configs import FileFilterConfig, FilterConfig, PipelineConfig
 from tensor_stereo.interop.formats import FORMATS
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.verdicts import Verdicts
+from tests.awkward_names import NAMES
 from tests.interop.match_batches import batch, expected, expected_of_any_views
 
 ENDINGS = (".npz", ".csv", ".parquet", ".h5", ".db")
@@ -248,3 +249,17 @@ def test_every_format_has_its_first_bytes(tmp_path: Path) -> None:
     for ending in ENDINGS[:3]:
         source = write_source(tmp_path, ending, batch(7))["source"]
         assert source.read_bytes().startswith(FORMATS[ending][0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_taken_as_they_are(tmp_path: Path, name: str) -> None:
+    for ending in ENDINGS:
+        folder = tmp_path / ending / name
+        folder.mkdir(parents=True)
+        arguments = write_source(folder, ending, batch(8))
+        renamed = folder / f"{name}{ending}"
+        arguments["source"].rename(renamed)
+        out = folder / "out" / f"{name}{ending.upper()}"
+        summary = filter_file(**(arguments | {"source": renamed, "out": out}))
+        assert summary.num_matches == batch(8).num_matches
+        assert files(out.parent) == [out.name]

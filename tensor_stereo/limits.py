@@ -9,7 +9,6 @@ from numbers import Integral, Number, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-
 MAX_ROWS = 1 << 26  # of a table or array that comes from elsewhere: 1 GB of coordinates
 
 
@@ -43,11 +42,13 @@ class Within:
 class Odd:
     """A number of pixels that has a middle one."""
 
+    high: int = 255
+
     def __contains__(self, value: int) -> bool:
-        return value >= 1 and value % 2 == 1
+        return 1 <= value <= self.high and value % 2 == 1
 
     def __str__(self) -> str:
-        return "be odd and at least 1"
+        return f"be odd and lie in [1, {self.high}]"
 
 
 Fraction = Annotated[float, Within(0, 1)]
@@ -73,7 +74,7 @@ def check_settings(settings: Any, *, prefix: str = "") -> None:
     >>> FASTConfig(window_px=10)
     Traceback (most recent call last):
     ...
-    tensor_stereo.limits.LimitError: FASTConfig.window_px must be odd and at least 1, got 10
+    tensor_stereo.limits.LimitError: FASTConfig.window_px must be odd and lie in [1, 255], got 10
     """
     kind: Any = type(settings)
     for name, hint in _hints(kind).items():

@@ -53,6 +53,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             code = run(command)
     except (ValueError, TypeError, ImportError, SweepError, OSError, UserWarning) as error:
         sys.exit(fail(_one_line(error), BAD_INPUT))
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+            raise
+        sys.exit(fail(f"there is not enough memory: {_one_line(error)}", BAD_INPUT))
     except KeyboardInterrupt:
         sys.exit(fail("interrupted", INTERRUPTED))
     if code:

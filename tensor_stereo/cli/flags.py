@@ -17,8 +17,8 @@ _FILES |= {"settings": "SETTINGS", "releases": "RELEASES", "matches": "MATCHES"}
 def name_flags(message: str) -> str:
     """The message with flags in the place of Python's arguments.
 
-    >>> name_flags("FASTConfig.window_px must be odd and at least 1, got 10")
-    '--fast.window-px must be odd and at least 1, got 10'
+    >>> name_flags("FASTConfig.window_px must be odd and lie in [1, 255], got 10")
+    '--fast.window-px must be odd and lie in [1, 255], got 10'
     >>> name_flags("min_precision needs the verdict 'score', got 'cardinality' with 0.9")
     "--min-precision needs --verdict score, got 'cardinality' with 0.9"
     """

@@ -57,7 +57,7 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
         detected = map_images(lambda image: _detect_opencv(image, config), gray.cpu())
     else:
         module = SIFTFeatureScaleSpace(
-            config.max_keypoints,
+            min(config.max_keypoints, 4 * gray.shape[-2] * gray.shape[-1]),  # it makes room for so many
             upright=config.upright,
             rootsift=False,
             device=gray.device,

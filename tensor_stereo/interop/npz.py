@@ -131,7 +131,7 @@ def _read_header(
             raise ValueError(f"its version must be 1.0 or 2.0, got {version}")
         if any(length < 0 for length in shape):
             raise ValueError(f"its shape must not be negative, got {shape}")
-    except (ValueError, TypeError, SyntaxError) as error:
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         raise ValueError(f"{place} has no readable header: {error}") from error
     return shape, dtype, head.tell()
 

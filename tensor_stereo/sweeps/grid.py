@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -17,6 +18,8 @@ from tensor_stereo.limits import LimitError
 _DEFAULT = TrialConfig()
 _TOP = ("grid", "export_matches")
 _MAX_LISTED = 20  # points in a message
+_MAX_BYTES, _MAX_KEY_PARTS, _MAX_POINTS = 1 << 20, 32, 100_000
+_KEY_PART = re.compile(r"""\s*[\w"'-]+\s*""")
 _RENAMED = {"restriction": "verdict"}
 
 
@@ -45,9 +48,13 @@ def read_grid(path: Path | str) -> SweepConfig:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of settings {path}")
+    if path.stat().st_size > _MAX_BYTES:
+        raise ValueError(f"{path} must have at most {_MAX_BYTES} bytes, got {path.stat().st_size}")
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+        _check_dots(text)
+        document = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML file: {error}") from error
     try:
         unknown = sorted(document.keys() - set(_TOP))
@@ -60,6 +67,15 @@ def read_grid(path: Path | str) -> SweepConfig:
         return SweepConfig(expand_grid(tables if isinstance(tables, list) else [tables]), export_matches)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _check_dots(text: str) -> None:
+    """Raise for keys of many parts, each of which costs the parser another table and a copy of the name so far."""
+    run = 0
+    for part in text.split("."):
+        run = run + 1 if _KEY_PART.fullmatch(part) else 0
+        if run > _MAX_KEY_PARTS:
+            raise ValueError(f"a key must have at most {_MAX_KEY_PARTS} parts")
 
 
 def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
@@ -99,6 +115,8 @@ def _expand(axes: Sequence[tuple[tuple[str, ...], list[Any]]]) -> list[TrialConf
     """The points of one product; raises for those that contradict themselves, all at once."""
     trials, wrong = [], []
     num_points = math.prod(len(values) for _, values in axes)
+    if num_points > _MAX_POINTS:
+        raise ValueError(f"a grid must have at most {_MAX_POINTS} points, got {num_points}")
     for values in itertools.product(*(values for _, values in axes)):
         settings: dict[str, Any] = {}
         for (names, _), value in zip(axes, values, strict=True):

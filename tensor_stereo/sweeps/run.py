@@ -203,7 +203,7 @@ def check_trials(config: SweepConfig) -> None:
     for number, trial in enumerate(config.trials):
         try:
             runner.run(trial)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RuntimeError, MemoryError) as error:
             raise ValueError(f"point {number} of the grid ({trial.detector}): {error}") from error
 
 

@@ -254,3 +254,11 @@ def test_damaged_data_is_noticed(tmp_path: Path) -> None:
     source.write_bytes(data[40:])  # its directory points before its beginning
     with pytest.raises(ValueError, match="which the archive cannot hold"):
         filter_npz(source, tmp_path / "out.npz", two_view_filter())
+
+
+@pytest.mark.parametrize("text", [b"{'a':" * 1900, b"-" * 9000 + b"1", b"(" * 9000])
+def test_a_header_nested_too_deeply_is_refused(tmp_path: Path, text: bytes) -> None:
+    head = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+    source = write_archive(tmp_path / "in.npz", {**GOOD, "z.npy": head})
+    with pytest.raises(ValueError, match="array 'z' has no readable header"):
+        filter_npz(source, tmp_path / "out.npz", two_view_filter())

@@ -239,3 +239,29 @@ def test_a_grid_is_all_of_its_points_or_an_error_that_names_those_without_sense(
     message = str(caught.value)
     assert all(reason in message for reason in bad[:20])
     assert f"{len(bad)} of {len(bad) + len(good)} points" in message or len(bad) + len(good) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = " + "[" * 5000, "is no TOML file"),
+        ("[grid]\nfast.window_px = " + "{a=" * 1000, "is no TOML file"),
+        (".".join(["a"] * 60000) + " = 1", "a key must have at most 32 parts"),
+        ("x = {" + '."b".'.join(["a"] * 60) + " = 1}", "a key must have at most 32 parts"),
+        ("# " + "x" * (1 << 20), "must have at most 1048576 bytes"),
+        (
+            "[grid]\nseed = " + str(list(range(400))) + "\noutlier_rate = " + str([k / 1000 for k in range(400)]),
+            "points",
+        ),
+        ("[grid]\nfast.window_px = 2147483647", "FASTConfig.window_px must be odd and lie in"),
+    ],
+)
+def test_a_file_that_would_take_gigabytes_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "sweep.toml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_grid(tmp_path / "sweep.toml")
+
+
+def test_many_floats_are_no_long_key(tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text("[grid]\noutlier_rate = [" + ", ".join(f"0.{k:03}" for k in range(60)) + "]\n")
+    assert len(read_grid(tmp_path / "sweep.toml").trials) == 60

@@ -9,6 +9,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -131,7 +132,7 @@ def _read_header(
             raise ValueError(f"its version must be 1.0 or 2.0, got {version}")
         if any(length < 0 for length in shape):
             raise ValueError(f"its shape must not be negative, got {shape}")
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+    except (ValueError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError) as error:
         raise ValueError(f"{place} has no readable header: {error}") from error
     return shape, dtype, head.tell()
 

@@ -91,7 +91,10 @@ def _is_whole_jpeg(content: bytes) -> bool:
             return False
         if marker[1][0] == _END:
             return has_scan
-        has_scan |= marker[1][0] == _SCAN
+        if marker[1][0] == _SCAN and not has_scan:
+            has_scan = True
+            if content.rstrip(b"\0").endswith(bytes([0xFF, _END])):  # as almost all do: no need to look at each byte
+                return True
         place = marker.end() + int.from_bytes(content[marker.end() : marker.end() + 2])  # over thumbnails and tables
 
 

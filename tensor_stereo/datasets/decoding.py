@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tensor_stereo.datasets.files import StrPath
 from tensor_stereo.datasets.netpbm import MAX_MAXVAL, decode_netpbm, is_netpbm
 from tensor_stereo.datasets.structure import PNG_SIGNATURE, damaged_format, significant_bits
-from tensor_stereo.datasets.tiff import STARTS, sample_range
+from tensor_stereo.datasets.tiff import STARTS, sample_range, without_orientation
 
 
 class Stored(NamedTuple):
@@ -68,12 +68,13 @@ def decode(path: StrPath) -> Stored:
     damaged = damaged_format(content)
     if damaged is not None:
         raise ValueError(f"{path} cannot be decoded as an image: the {damaged} file is truncated or damaged")
-    samples = _decode_by_opencv(path, content)
+    is_tiff = content.startswith(STARTS)
+    samples = _decode_by_opencv(path, without_orientation(content) if is_tiff else content)
     if samples.dtype != np.uint16:
         return Stored(samples, 255)
     if content.startswith(PNG_SIGNATURE):
         return Stored(samples, None, significant_bits(content))
-    if content.startswith(STARTS):
+    if is_tiff:
         bits, largest = sample_range(content)
         fill = 16 - bits
         if fill > 0 and not (samples & (2**fill - 1)).any():  # OpenCV shifts samples of 10, 12 and 14 bits up

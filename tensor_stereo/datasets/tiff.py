@@ -7,16 +7,26 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from io import BytesIO
-from typing import BinaryIO, TypeAlias
+from typing import BinaryIO, NamedTuple, TypeAlias
 
 Tags: TypeAlias = dict[int, tuple[int, ...]]
 
 STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-WIDTH, HEIGHT, BITS, COMPRESSION, MAX_SAMPLE = 256, 257, 258, 259, 281
+WIDTH, HEIGHT, BITS, COMPRESSION, ORIENTATION, MAX_SAMPLE = 256, 257, 258, 259, 274, 281
 _PLACES = ((273, 279), (324, 325))  # offsets and byte counts of strips, or of tiles
 _DEFLATE = (8, 32946)
 _CODES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # types of whole numbers
+
+
+class _Entry(NamedTuple):
+    """One tag of a directory: where its value stands in the file if it fits there, and its whole numbers."""
+
+    tag: int
+    place: int
+    form: str  # of one number, for struct
+    numbers: tuple[int, ...]
 
 
 def read_tags(file: BinaryIO) -> Tags:
@@ -31,12 +41,16 @@ def read_tags(file: BinaryIO) -> Tags:
     >>> read_tags(BytesIO(b"II*\0" + struct.pack("<IHHHIII", 8, 1, 256, 3, 1, 7, 0)))
     {256: (7,)}
     """
+    return {entry.tag: entry.numbers for entry in _read_entries(file)}
+
+
+def _read_entries(file: BinaryIO) -> Iterator[_Entry]:
     start = file.read(16)
     if not start.startswith(STARTS):
         raise ValueError("it starts like no TIFF file")
     size = file.seek(0, 2)
     order, is_big = "<" if start[:1] == b"I" else ">", b"+" in start[:4]
-    counts, entry_format, inline = ("Q", "HHQ8s", 8) if is_big else ("H", "HHI4s", 4)
+    number, counts, rest, inline = ("Q", "Q", "HHQ", 8) if is_big else ("I", "H", "HHI", 4)
 
     def take(offset: int, num_bytes: int) -> bytes:
         if offset + num_bytes > size:
@@ -46,21 +60,34 @@ def read_tags(file: BinaryIO) -> Tags:
 
     if len(start) < 2 * inline:
         raise ValueError("it ends before its directory does")
-    (place,) = struct.unpack_from(order + ("Q" if is_big else "I"), start, 8 if is_big else 4)
+    (place,) = struct.unpack_from(order + number, start, inline)
     (num_entries,) = struct.unpack(order + counts, take(place, struct.calcsize(counts)))
-    width = struct.calcsize("<" + entry_format)
-    entries = take(place + struct.calcsize(counts), num_entries * width)
-    tags: Tags = {}
-    for tag, kind, count, value in struct.iter_unpack(order + entry_format, entries):
+    place += struct.calcsize(counts)
+    head = struct.calcsize("<" + rest)
+    entries = take(place, num_entries * (head + inline))
+    for k in range(num_entries):
+        first = k * (head + inline)
+        tag, kind, count = struct.unpack_from(order + rest, entries, first)
         code = _CODES.get(kind)
         if code is None:
             continue
-        num_bytes = count * struct.calcsize(code)
+        value, num_bytes = entries[first + head : first + head + inline], count * struct.calcsize(code)
         if num_bytes > inline:
-            (offset,) = struct.unpack(order + ("Q" if is_big else "I"), value)
-            value = take(offset, num_bytes)
-        tags[tag] = struct.unpack_from(f"{order}{count}{code}", value)
-    return tags
+            value = take(struct.unpack(order + number, value)[0], num_bytes)
+        yield _Entry(tag, place + first + head, order + code, struct.unpack_from(f"{order}{count}{code}", value))
+
+
+def without_orientation(content: bytes) -> bytes:
+    """The file with the orientation in which its image is stored, which OpenCV would turn as the file asks for.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    for entry in _read_entries(BytesIO(content)):
+        if entry.tag == ORIENTATION and entry.numbers != (1,):
+            stop = entry.place + struct.calcsize(entry.form)
+            return content[: entry.place] + struct.pack(entry.form, 1) + content[stop:]
+    return content
 
 
 def tiff_size(file: BinaryIO) -> tuple[int, int]:

@@ -60,6 +60,33 @@ def test_lossless_formats_keep_every_value_in_the_order_rgb(tmp_path, name):
     np.testing.assert_array_equal(image.permute(1, 2, 0).numpy(), PIXELS[..., ::-1])
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("ending", "mode"),
+    [
+        *((ending, mode) for ending in ("tif", "png", "webp", "jpg") for mode in ("L", "RGB")),
+        ("tif", "I;16"),
+        ("png", "I;16"),
+    ],
+)
+def test_no_format_is_turned(tmp_path, ending, mode, orientation):
+    grey = np.array([[255, 255, 255], [0, 0, 255]], np.uint8).repeat(16, 0).repeat(16, 1)
+    pixels = {"L": grey, "RGB": np.dstack([grey] * 3), "I;16": grey.astype(np.uint16) * 257}[mode]
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(pixels).save(tmp_path / f"a.{ending}", exif=exif)
+    image = read_image(tmp_path / f"a.{ending}")
+    assert image_size(tmp_path / f"a.{ending}") == (48, 32)
+    np.testing.assert_allclose(image[0].numpy(), grey, atol=40 if ending in ("webp", "jpg") else 0)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("big", [False, True])
+def test_orientation_is_put_aside_in_either_order_of_bytes(tmp_path, order, big):
+    path = write(tmp_path / "a.tif", tiff([0, 257 * 7, 65535], 16, order=order, big=big, tags={274: 6}))
+    assert read_image(path).tolist() == [[[0, 7, 255]]]
+
+
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])

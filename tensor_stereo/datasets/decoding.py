@@ -9,10 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tensor_stereo.datasets.decoder_messages import caught_messages
 from tensor_stereo.datasets.files import StrPath
+from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.datasets.netpbm import MAX_MAXVAL, decode_netpbm, is_netpbm
 from tensor_stereo.datasets.structure import PNG_SIGNATURE, damaged_format, significant_bits
 from tensor_stereo.datasets.tiff import STARTS, sample_range, without_orientation
+
+MAX_PIXELS = 1 << 26  # 8192 x 8192
 
 
 class Stored(NamedTuple):
@@ -68,6 +72,7 @@ def decode(path: StrPath) -> Stored:
     damaged = damaged_format(content)
     if damaged is not None:
         raise ValueError(f"{path} cannot be decoded as an image: the {damaged} file is truncated or damaged")
+    _check_size(path)
     is_tiff = content.startswith(STARTS)
     samples = _decode_by_opencv(path, without_orientation(content) if is_tiff else content)
     if samples.dtype != np.uint16:
@@ -83,6 +88,16 @@ def decode(path: StrPath) -> Stored:
     return Stored(samples, None)
 
 
+def _check_size(path: StrPath) -> None:
+    """Raise for headers that ask for more memory than any view of a pair needs; OpenCV would take 2**30 pixels."""
+    try:
+        width, height = image_size(path)
+    except ValueError:  # the decoder says it better, and knows more formats
+        return
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"{path} must have at most {MAX_PIXELS} pixels, its header says {width} x {height}")
+
+
 def _replicated(original: NDArray[Any], bits: int) -> NDArray[Any]:
     """Samples of 16 bits that repeat the given ones of fewer bits from the most significant bit on."""
     filled = np.zeros_like(original)
@@ -95,9 +110,12 @@ def _decode_by_opencv(path: StrPath, content: bytes) -> NDArray[Any]:
     """(H, W), or (H, W, C) in the order RGB or RGBA."""
     encoded = np.frombuffer(content, dtype=np.uint8)
     try:
-        pixels: NDArray[Any] | None = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+        with caught_messages() as messages:
+            pixels: NDArray[Any] | None = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(f"{path} cannot be decoded as an image: {error}") from error
+    if messages.damage:
+        raise ValueError(f"{path} cannot be decoded as an image: {messages.damage}")
     if pixels is None:
         raise ValueError(f"{path} cannot be decoded as an image: the format is unknown or the file is damaged")
     if pixels.ndim == 2:

@@ -16,7 +16,9 @@ from contextlib import contextmanager, suppress
 _DAMAGE = re.compile(
     r"libpng error.*|.*premature end .*|.*bad Huffman code.*|.*instead of RST.*|.*[Cc]orrupt JPEG data: found.*"
 )
-_OF_DECODERS = re.compile(r"libpng |Corrupt JPEG|Premature end|Invalid |Unsupported |\[ *(WARN|ERROR|INFO)|JPEG|TIFF")
+_OF_DECODERS = re.compile(
+    r"libpng |Corrupt JPEG|Premature end|Invalid |Unsupported |Warning: |\[ *(WARN|ERROR|INFO)|JPEG|TIFF"
+)
 _LOCK = threading.Lock()
 
 

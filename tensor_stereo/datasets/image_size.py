@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 from tensor_stereo.datasets.files import StrPath
 from tensor_stereo.datasets.structure import JPEG_START
@@ -13,6 +13,7 @@ from tensor_stereo.datasets.tiff import STARTS, tiff_size
 
 _PNG_START = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # W3C PNG, sections 5.2 and 11.2.1: IHDR comes first
 _PNM_HEADER = re.compile(rb"P[1-6](?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})(?:\s+(?:#[^\n]*\n\s*)*)(\d{1,9})\s")
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15 without tables and extensions
 _HEADER_BYTES = 1024  # netpbm headers may hold comments
 
 
@@ -45,10 +46,12 @@ def image_size(path: StrPath) -> tuple[int, int]:
                 return tiff_size(file)
             except ValueError as error:
                 raise ValueError(f"{path} is no readable TIFF file: {error}") from error
+        if start.startswith(JPEG_START):
+            return _jpeg_size(path, file)
     if start.startswith(b"RIFF") and start[8:12] == b"WEBP":
         return _webp_size(path, start)
-    if start.startswith((JPEG_START, b"BM")):
-        return _size_by_pillow(path, start)
+    if start.startswith(b"BM"):
+        return _bmp_size(path, start)
     header = _PNM_HEADER.match(start)
     if header is None:
         formats = "PNG, PPM, PGM, PBM, TIFF, JPEG, WebP or BMP"
@@ -70,20 +73,23 @@ def _webp_size(path: Path, start: bytes) -> tuple[int, int]:
     raise ValueError(f"{path} is no readable image, its WebP header is damaged")
 
 
-def _size_by_pillow(path: Path, start: bytes) -> tuple[int, int]:
-    """The size that a file's own plug-in of Pillow reads.
+def _jpeg_size(path: Path, file: IO[bytes]) -> tuple[int, int]:
+    """By the header of the frame: ITU-T T.81, sections B.1.1 and B.2.2. Pillow would warn of damaged metadata."""
+    place = 2
+    while True:
+        file.seek(place)
+        head = file.read(9)
+        if len(head) < 9 or head[0] != 0xFF:
+            raise ValueError(f"{path} is no readable image, its JPEG header is damaged")
+        if head[1] in _JPEG_FRAMES:
+            height, width = struct.unpack(">HH", head[5:9])
+            return width, height
+        place += 1 if head[1] == 0xFF else 2 + int.from_bytes(head[2:4])  # FF before a marker is padding
 
-    ``Image.open`` would warn of large images, which is no matter before decoding, and of damaged additions to JPEG.
-    """
-    from PIL.BmpImagePlugin import BmpImageFile
-    from PIL.JpegImagePlugin import JpegImageFile
 
-    kinds: dict[bytes, Any] = {b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile}
-    try:
-        with kinds[start[:2]](path) as image:
-            width, height = image.size
-            return int(width), int(height)
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # damaged headers raise anything, struct.error and IndexError among it
-        raise ValueError(f"{path} is no readable image, its header is damaged: {error}") from error
+def _bmp_size(path: Path, start: bytes) -> tuple[int, int]:
+    """By Microsoft's BITMAPINFOHEADER; the height of bitmaps that begin at the top is negative."""
+    if len(start) < 26 or int.from_bytes(start[14:18], "little") < 40:
+        raise ValueError(f"{path} is no readable image, its BMP header is damaged")
+    width, height = struct.unpack("<ii", start[18:26])
+    return width, abs(height)

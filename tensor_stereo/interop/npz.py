@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import math
 import shutil
+import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
 
@@ -37,7 +39,7 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
         ValueError: if the archive is damaged or an array is wrong; the message names file and array, and pair and row.
     """
     try:
-        with zipfile.ZipFile(source) as archive:
+        with zipfile.ZipFile(source) as archive, _headers_of_python_2():
             members = _check_members(source, archive)
             form = find_form(str(source), {name: header for name, (_, header) in members.items()})
 
@@ -64,10 +66,18 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
     return FilterSummary().add(read_pairs.matches.num_pairs, verdicts)
 
 
+@contextmanager
+def _headers_of_python_2() -> Iterator[None]:
+    """Read what Python 2 has written without NumPy's advice to write it again."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Reading `.npy` or `.npz` file required", UserWarning)
+        yield
+
+
 def is_rectified(source: Path) -> bool:
     """Whether the form of an archive promises rectified pairs; True if it is damaged, which is found later."""
     try:
-        with zipfile.ZipFile(source) as archive:
+        with zipfile.ZipFile(source) as archive, _headers_of_python_2():
             members = _check_members(source, archive)
         return find_form(str(source), {name: header for name, (_, header) in members.items()}).is_rectified
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError):

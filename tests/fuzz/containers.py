@@ -128,7 +128,7 @@ def _with_values(member: bytes, rng: Random) -> bytes:
     """The same array with some extreme values."""
     try:
         values = np.load(io.BytesIO(member), allow_pickle=False).copy()
-    except (ValueError, EOFError, SyntaxError, RecursionError, MemoryError):  # of a member that was changed before
+    except Exception:  # of a member that was changed before
         return member
     if values.size and values.dtype.kind in "fiu":
         flat = values.reshape(-1)

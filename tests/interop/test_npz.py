@@ -262,3 +262,12 @@ def test_a_header_nested_too_deeply_is_refused(tmp_path: Path, text: bytes) -> N
     source = write_archive(tmp_path / "in.npz", {**GOOD, "z.npy": head})
     with pytest.raises(ValueError, match="array 'z' has no readable header"):
         filter_npz(source, tmp_path / "out.npz", two_view_filter())
+
+
+def test_headers_of_python_2_are_read(tmp_path: Path) -> None:
+    """Its integers end in L."""
+    points = array_file(np.arange(12.0).reshape(6, 2))
+    old = points.replace(b"(6, 2), }", b"(6L, 2L)}")
+    assert old != points
+    source = write_archive(tmp_path / "in.npz", {**GOOD, "keypoints0.npy": old})
+    assert filter_npz(source, tmp_path / "out.npz", two_view_filter()).num_matches == 6

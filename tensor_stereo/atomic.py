@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 _MAX_NAME_BYTES = 255  # of the usual file systems
 _NOT_OFFERED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
@@ -60,6 +61,36 @@ def flush_file(descriptor: int) -> None:
     except OSError as error:
         if error.errno not in _NOT_OFFERED:
             raise
+
+
+def append_line(line: bytes, file: IO[bytes]) -> None:
+    """Add a line that is on disk when this returns, or is not there.
+
+    Args:
+        line: Without its line break.
+        file: Opened for appending, without a buffer.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    end = os.fstat(file.fileno()).st_size
+    try:
+        if file.write(line + b"\n") != len(line) + 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), file.name)
+        flush_file(file.fileno())
+    except OSError:
+        file.truncate(end)
+        raise
+
+
+def drop_torn_line(file: IO[bytes], path: Path) -> None:
+    """Cut off the last line of a file if the end of its process has torn it.
+
+    Args:
+        file: Opened for appending, without a buffer.
+        path: Its path.
+    """
+    file.truncate(path.read_bytes().rfind(b"\n") + 1)
 
 
 def _flush_rename(folder: Path) -> None:

@@ -56,7 +56,16 @@ def has_ending(path: Path, endings: str | Sequence[str]) -> bool:
     >>> has_ending(Path("disp0.PFM"), ".pfm"), has_ending(Path("a.png.txt"), (".png", ".jpg"))
     (True, False)
     """
-    return path.suffix.casefold() in ((endings,) if isinstance(endings, str) else endings)
+    return ending_of(path) in ((endings,) if isinstance(endings, str) else endings)
+
+
+def ending_of(path: Path) -> str:
+    """The ending of a path in lower case.
+
+    >>> ending_of(Path("matches.NPZ"))
+    '.npz'
+    """
+    return path.suffix.casefold()
 
 
 def check_ending(name: str, path: Path, endings: Sequence[str]) -> None:

@@ -39,13 +39,12 @@ def read_parquet(path: Path) -> pl.DataFrame:
     ...     read_parquet(Path(folder, "[1]*.parquet"))["a"].to_list()
     [1, 2]
     """
-    with path.open("rb"):
-        pass  # so that a missing file is told from a damaged one
-    _DECODER.check(path)
-    try:
-        return pl.read_parquet(path.absolute(), glob=False, hive_partitioning=False)
-    except _FAILURES as error:
-        raise ValueError(f"{path} is no readable Parquet file: {error}") from error
+    with path.open("rb") as file:
+        _DECODER.check(path)
+        try:
+            return pl.read_parquet(file, glob=False, hive_partitioning=False)
+        except _FAILURES as error:
+            raise ValueError(f"{path} is no readable Parquet file: {_one_line(error)}") from error
 
 
 def scan_parquet(paths: Sequence[Path], schema: dict[str, Any]) -> pl.LazyFrame:
@@ -53,6 +52,8 @@ def scan_parquet(paths: Sequence[Path], schema: dict[str, Any]) -> pl.LazyFrame:
     if not paths:
         return pl.LazyFrame(schema=schema)
     files = [path.absolute() for path in paths]
+    for path in files:
+        check_name(path)
     return pl.scan_parquet(files, schema=schema, missing_columns="insert", glob=False, hive_partitioning=False)
 
 
@@ -74,12 +75,13 @@ def read_csv(path: Path) -> pl.DataFrame:
     with path.open("rb") as file:
         if file.read(4).startswith(_COMPRESSED):
             raise ValueError(f"{path} is compressed, not a CSV file; unpack it first")
-    settings: dict[str, Any] = {"glob": False, "infer_schema": False}
-    try:
-        header = pl.read_csv(path.absolute(), has_header=False, n_rows=1, **settings).row(0)
-        table = pl.read_csv(path.absolute(), **settings)
-    except _FAILURES as error:
-        raise ValueError(f"{path} is no readable CSV file: {error}") from error
+        file.seek(0)
+        try:
+            header = pl.read_csv(file, has_header=False, n_rows=1, infer_schema=False).row(0)
+            file.seek(0)
+            table = pl.read_csv(file, infer_schema=False)
+        except _FAILURES as error:
+            raise ValueError(f"{path} is no readable CSV file: {_one_line(error)}") from error
     names = [_unquoted(name or "") for name in header]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -91,6 +93,23 @@ def read_csv(path: Path) -> pl.DataFrame:
     if len(table) > MAX_ROWS:
         raise ValueError(f"{path} must have at most {MAX_ROWS} rows, got {len(table)}")
     return table
+
+
+def check_name(path: Path) -> None:
+    """Raise for names that are no UTF-8, which no table can hold and Polars cannot open.
+
+    Raises:
+        ValueError: naming the path.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{str(path).encode(errors='replace').decode()} has a name that is no UTF-8") from None
+
+
+def _one_line(error: Exception) -> str:
+    """The first sentence of what Polars says; the rest is advice to programmers."""
+    return " ".join(str(error).strip().split("\n", 1)[0].split())
 
 
 def _unquoted(name: str) -> str:
@@ -141,7 +160,7 @@ class _Decoder:
         if answer.get("num_rows", 0) > MAX_ROWS:
             raise ValueError(f"{path} must have at most {MAX_ROWS} rows, got {answer['num_rows']}")
         if "error" in answer:
-            raise ValueError(f"{path} is no readable Parquet file: {' '.join(answer['error'].split())}")
+            raise ValueError(f"{path} is no readable Parquet file: {answer['error']}")
 
     def _ask(self, path: Path) -> dict[str, Any] | None:
         """The answer of the process; None if it ended or hung."""
@@ -190,12 +209,14 @@ for line in sys.stdin:
     path, max_rows = json.loads(line)
     answer = {}
     try:
-        table = pl.scan_parquet(path, glob=False, hive_partitioning=False)
-        answer["num_rows"] = table.select(pl.len()).collect().item()
-        if answer["num_rows"] <= max_rows:
-            table.collect()
+        with open(path, "rb") as file:
+            table = pl.scan_parquet(file, glob=False, hive_partitioning=False)
+            answer["num_rows"] = table.select(pl.len()).collect().item()
+            if answer["num_rows"] <= max_rows:
+                file.seek(0)
+                pl.read_parquet(file, glob=False, hive_partitioning=False)
     except BaseException as error:
-        answer["error"] = str(error)
+        answer["error"] = " ".join(str(error).strip().split("\\n", 1)[0].split())
     print(json.dumps(answer), flush=True)
 """
 _DECODER = _Decoder()

@@ -17,9 +17,19 @@ _DAMAGE = re.compile(
     r"libpng error.*|.*premature end .*|.*bad Huffman code.*|.*instead of RST.*|.*[Cc]orrupt JPEG data: found.*"
 )
 _OF_DECODERS = re.compile(
-    r"libpng |Corrupt JPEG|Premature end|Invalid |Unsupported |Warning: |\[ *(WARN|ERROR|INFO)|JPEG|TIFF"
+    r"libpng (warning|error): .*|Corrupt JPEG data: .*|Premature end of JPEG .*|Invalid SOS parameters .*|"
+    r"Warning: unknown JFIF revision .*|Unsupported marker type .*|\[ *(WARN|ERROR|INFO):\d+@.*"
 )
 _LOCK = threading.Lock()
+
+
+def _renew_lock() -> None:
+    global _LOCK  # a thread of the parent may have held it when this process was forked
+    _LOCK = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_lock)
 
 
 class DecoderMessages:
@@ -56,6 +66,6 @@ def caught_messages() -> Iterator[DecoderMessages]:
         said = file.read().decode(errors="replace").splitlines()
     found = (_DAMAGE.fullmatch(line.strip()) for line in said)
     messages.damage = next((match[0] for match in found if match), "")
-    others = [line for line in said if not _OF_DECODERS.match(line.strip())]
+    others = [line for line in said if not _OF_DECODERS.fullmatch(line.strip())]
     if others:
         os.write(2, "".join(f"{line}\n" for line in others).encode())

@@ -14,7 +14,7 @@ from tensor_stereo.datasets.files import StrPath
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.datasets.netpbm import MAX_MAXVAL, decode_netpbm, is_netpbm
 from tensor_stereo.datasets.structure import PNG_SIGNATURE, damaged_format, significant_bits
-from tensor_stereo.datasets.tiff import STARTS, sample_range, without_orientation
+from tensor_stereo.datasets.tiff import STARTS, has_white_zero, sample_range, without_orientation
 
 MAX_PIXELS = 1 << 26  # 8192 x 8192
 
@@ -84,6 +84,9 @@ def decode(path: StrPath) -> Stored:
         fill = 16 - bits
         if fill > 0 and not (samples & (2**fill - 1)).any():  # OpenCV shifts samples of 10, 12 and 14 bits up
             samples = samples >> fill
+        if has_white_zero(content):
+            samples = (2**bits - 1 if largest is None else largest) - samples.astype(np.int64)
+            samples = samples.clip(0).astype(np.uint16)
         return Stored(samples, largest)
     return Stored(samples, None)
 

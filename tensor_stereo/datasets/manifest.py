@@ -22,7 +22,7 @@ from tensor_stereo.datasets.files import (
 )
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.paths import check_ending, has_ending
-from tensor_stereo.table_files import read_csv, read_parquet, write_table
+from tensor_stereo.table_files import check_name, read_csv, read_parquet, write_table
 
 _PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration")
 SCHEMA = {
@@ -89,6 +89,7 @@ def build_manifest(
     _check_names(pairs)
     rows = []
     for pair in pairs:
+        check_name(pair.image0.resolve())
         width, height = image_size(pair.image0)
         paths = {name: getattr(pair, name) for name in _PATHS}
         rows.append(

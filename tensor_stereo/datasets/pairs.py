@@ -119,7 +119,8 @@ def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> Flo
     stored = read_pfm(path)
     if stored.ndim != 2:
         raise ValueError(f"{path} must have one channel (Pf), got shape {stored.shape}")
-    disparity = stored / np.float32(1.0 if scale is None else scale)
+    with np.errstate(all="ignore"):  # damaged files hold anything, signalling NaN among it
+        disparity = stored / np.float32(1.0 if scale is None else scale)
     disparity[~np.isfinite(disparity)] = np.nan
     if files.gt_encoding == "flyingthings3d-subset" and np.nansum(disparity, dtype=np.float64) < 0:
         disparity = -disparity

@@ -14,7 +14,7 @@ from typing import BinaryIO, NamedTuple, TypeAlias
 Tags: TypeAlias = dict[int, tuple[int, ...]]
 
 STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-WIDTH, HEIGHT, BITS, COMPRESSION, ORIENTATION, MAX_SAMPLE = 256, 257, 258, 259, 274, 281
+WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, ORIENTATION, MAX_SAMPLE = 256, 257, 258, 259, 262, 274, 281
 _PLACES = ((273, 279), (324, 325))  # offsets and byte counts of strips, or of tiles
 _DEFLATE = (8, 32946)
 _CODES = {1: "B", 3: "H", 4: "I", 16: "Q"}  # types of whole numbers
@@ -88,6 +88,11 @@ def without_orientation(content: bytes) -> bytes:
             stop = entry.place + struct.calcsize(entry.form)
             return content[: entry.place] + struct.pack(entry.form, 1) + content[stop:]
     return content
+
+
+def has_white_zero(content: bytes) -> bool:
+    """Whether 0 is white: OpenCV turns such samples over if they have 8 bits, and leaves those of 16 bits alone."""
+    return read_tags(BytesIO(content)).get(PHOTOMETRIC, (1,))[0] == 0
 
 
 def tiff_size(file: BinaryIO) -> tuple[int, int]:

@@ -52,9 +52,10 @@ def filter_colmap(source: Path, target: Path, run: MatchFilter) -> FilterSummary
         OSError: if the copy cannot be written.
         ImportError: if pycolmap is not installed.
     """
-    wal = source.with_name(f"{source.name}-wal")
-    if wal.is_file() and wal.stat().st_size:
-        raise ValueError(f"{source} is not finished, part of it is in {wal.name}: close the program that writes it")
+    for ending in ("-wal", "-journal"):
+        part = source.with_name(f"{source.name}{ending}")
+        if part.is_file() and part.stat().st_size:
+            raise ValueError(f"{source} is not finished, see {part.name}: close the program that writes it")
     shutil.copyfile(source, target)
     try:
         with closing(sqlite3.connect(target, isolation_level=None)) as database:

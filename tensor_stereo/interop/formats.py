@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tensor_stereo.interop.result_names import check_score_name
-from tensor_stereo.paths import check_apart, check_ending, check_source, has_ending, prepare_target
+from tensor_stereo.paths import check_apart, check_ending, check_source, ending_of, has_ending, prepare_target
 
 # Ending -> first bytes of such a file, and what it is called.
 FORMATS = {
@@ -29,7 +29,7 @@ def check_files(source: Path, out: Path, keypoints: Path | None, score_name: str
         FileNotFoundError: if a file is missing.
         OSError: if ``out`` cannot be written.
     """
-    ending = source.suffix.casefold()
+    ending = ending_of(source)
     check_ending("source", source, tuple(FORMATS))
     check_score_name(score_name)
     if score_name is not None and ending in (".h5", ".db"):

@@ -99,6 +99,15 @@ def member(place: Path | str, group: Any, name: str | bytes) -> Any:
     return group[name] if has(place, group, name) else None
 
 
+def is_exported(source: Path, group: Any) -> bool:
+    """Whether a group is a pair with its keypoints, as glue-factory exports it.
+
+    hloc's dense matchers leave keypoints in a group too, with ``scores``; but there ``matches0`` means keypoints of the
+    file of features.
+    """
+    return all(has(source, group, name) for name in OF_PAIR) and not has(source, group, "scores")
+
+
 def find_exported(source: Path, file: Any) -> list[str]:
     """The groups that hold a pair with its keypoints, as glue-factory exports them.
 
@@ -112,7 +121,7 @@ def find_exported(source: Path, file: Any) -> list[str]:
         while pending:
             path = pending.pop()
             group = file[f"/{path}"]
-            if path and all(has(source, group, name) for name in OF_PAIR):
+            if path and is_exported(source, group):
                 found.append(path)
                 continue
             for name in reversed(list(group)):

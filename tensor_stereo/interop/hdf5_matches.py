@@ -22,11 +22,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tensor_stereo.interop.hdf5 import OF_PAIR, Copy, find_exported, has, member, open_file, read, reading
+from tensor_stereo.interop.hdf5 import OF_PAIR, Copy, find_exported, has, is_exported, member, open_file, read, reading
 from tensor_stereo.interop.index_arrays import Indices, index_matches
+from tensor_stereo.interop.result_names import ResultNames, name_results
 from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, Verdicts, filter_each
 from tensor_stereo.types import Matches
 
+_NOTE = "putative_results"  # attribute with the names of the results
 _INDEXED = ("matches0", "matches1")
 _SCORES = ("matching_scores0", "matching_scores1")
 
@@ -135,7 +137,7 @@ def _find_pairs(source: Path, matches_file: Any, keypoints: Path, images: dict[s
             group = member(source, matches_file, name0)
             if not isinstance(group, h5py.Group):
                 raise ValueError(f"{source}: {name0!r} must be a group of pairs, got a dataset")
-            if has(source, group, "keypoints0"):
+            if is_exported(source, group):
                 raise ValueError(f"{source}: {name0!r} holds its keypoints, as of glue-factory; leave keypoints out")
             if isinstance(member(source, group, "matches0"), h5py.Dataset) and "matches0" not in images:
                 cuts = (k for k, letter in enumerate(name0) if letter == "_")
@@ -204,7 +206,7 @@ def _read_hloc(place: str, matches_file: Any, pair: _Pair, arrays: dict[str, Arr
         arrays["matches0"] = read(place, group, "matches0", "iu", 1)
         if has(place, group, "matching_scores0"):
             arrays["matching_scores0"] = read(place, group, "matching_scores0", "f", 1)
-    matches, indices = index_matches(place, arrays)
+    matches, indices = index_matches(place, arrays, may_be_short=True)
     return _Found(pair, arrays["matches0"], indices), matches
 
 
@@ -232,34 +234,50 @@ def _read_keypoints(keypoints: Path, features: Any, image: str) -> Array:
 def _write_group(group: Any, found: _Found, verdicts: Verdicts) -> None:
     """Write -1 for what is rejected, and the verdicts beside it."""
     indices = found.indices
-    wide = verdicts.spread(indices.mask)
-    score = None if wide.score is None else wide.score.astype(np.float32)
-    for name, values in {"putative_matches0": found.stored, **wide._asdict(), "score": score}.items():
-        if group.id.links.exists(name.encode()):  # of an earlier filter
-            del group[name]
-        if values is not None:
-            group.create_dataset(name, data=values)
-    group["matches0"][...] = np.where(~indices.mask | wide.inlier, found.stored, -1)
+    taken = set(group)
+    for name in _earlier(group, "putative_matches0"):
+        del group[name]
+        taken.remove(name)
+    results = _results(found, verdicts, "putative_matches0", taken)
+    for name, values in results.items():
+        group.create_dataset(name, data=values)
+    group["putative_matches0"].attrs[_NOTE] = [name for name in results if name != "putative_matches0"]
+    group["matches0"][...] = np.where(~indices.mask | verdicts.spread(indices.mask).inlier, found.stored, -1)
     if found.pair.form == "glue-factory" and "matches1" in group:
         partner = group["matches1"][()]
         rejected = ~verdicts.inlier
         rows0, rows1 = indices.rows0[rejected], indices.rows1[rejected]
-        known = rows1 < len(partner)
-        rows0, rows1 = rows0[known], rows1[known]
         partner[rows1[partner[rows1] == rows0]] = -1
         group["matches1"][...] = partner
+
+
+def _results(found: _Found, verdicts: Verdicts, mark: str, taken: set[str]) -> dict[str, Any]:
+    """Results by their names. ``mark`` is the array as it was, and tells the results of an earlier filter."""
+    wide = verdicts.spread(found.indices.mask)
+    score = None if wide.score is None else wide.score.astype(np.float32)
+    names = name_results(found.pair.path, taken)
+    results = {mark: found.stored, names.inlier: wide.inlier, names.score: score, names.relation: wide.relation}
+    return {name: values for name, values in results.items() if values is not None}
+
+
+def _earlier(stored: Any, mark: str) -> list[str]:
+    """What an earlier filter wrote into a group, or into the attributes of a dataset."""
+    if not (has("", stored, mark) if hasattr(stored, "create_group") else mark in stored):
+        return []
+    notes = getattr(stored[mark], "attrs", stored)  # beside the results, whose names they tell
+    return [name for name in (mark, _NOTE, *notes.get(_NOTE, ResultNames())) if name in stored]
 
 
 def _replace_dataset(file: Any, found: _Found, verdicts: Verdicts) -> None:
     """Write the inliers alone, with all matches as attributes, where no reader of DISK's files looks."""
     stored = found.stored
-    wide = verdicts.spread(found.indices.mask)
-    kept = stored[wide.inlier] if found.in_rows else stored[:, wide.inlier]
-    attributes = dict(file[found.pair.path].attrs)
+    keep = verdicts.spread(found.indices.mask).inlier
+    old = file[found.pair.path].attrs
+    earlier = _earlier(old, "putative_matches")
+    attributes = {name: value for name, value in old.items() if name not in earlier}
+    results = _results(found, verdicts, "putative_matches", set(attributes))
+    attributes |= results | {_NOTE: [name for name in results if name != "putative_matches"]}
     del file[found.pair.path]
-    dataset = file.create_dataset(found.pair.path, data=kept)
-    score = None if wide.score is None else wide.score.astype(np.float32)
-    results = {"putative_matches": stored, **wide._asdict(), "score": score}
-    for name, values in (attributes | results).items():
-        if values is not None:
-            dataset.attrs[name] = values
+    dataset = file.create_dataset(found.pair.path, data=stored[keep] if found.in_rows else stored[:, keep])
+    for name, values in attributes.items():
+        dataset.attrs[name] = values

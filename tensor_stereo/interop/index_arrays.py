@@ -38,7 +38,7 @@ class Indices(NamedTuple):
         return set(zip(self.rows0.tolist(), self.rows1.tolist(), strict=True))
 
 
-def index_matches(place: str, arrays: Mapping[str, Array]) -> tuple[Matches, Indices]:
+def index_matches(place: str, arrays: Mapping[str, Array], *, may_be_short: bool = False) -> tuple[Matches, Indices]:
     """The matches of one pair that is given by keypoints and index arrays.
 
     Args:
@@ -47,6 +47,7 @@ def index_matches(place: str, arrays: Mapping[str, Array]) -> tuple[Matches, Ind
             ``matches0`` (N0,) and ``matches1`` (N1,), the row of the partner in the other view; ``matches`` and
             ``matches01``, the same as ``matches0`` or (S, 2) rows of both views. -1 is no match and -2 "ignore". Every
             array may have a batch axis of one in front. Confidences have a value for each entry of their index array.
+        may_be_short: Whether the last keypoints may have no entry in an index array, as hloc leaves them out.
 
     Returns:
         The matches, with the cost 1 - confidence where there is one, and their indices.
@@ -62,7 +63,7 @@ def index_matches(place: str, arrays: Mapping[str, Array]) -> tuple[Matches, Ind
     points0, points1 = (_one_pair(place, name, arrays[name], 2) for name in ("keypoints0", "keypoints1"))
     is_batch = arrays["keypoints0"].ndim == 3
     found = {
-        name: _read_indices(place, name, arrays[name], len(points0), len(points1), is_batch)
+        name: _read_indices(place, name, arrays[name], (len(points0), len(points1)), is_batch, may_be_short)
         for name in INDEX_ARRAYS
         if name in arrays
     }
@@ -84,8 +85,10 @@ def _one_pair(place: str, name: str, array: Array, ndim: int) -> Array:
     return array
 
 
-def _read_indices(place: str, name: str, array: Array, num0: int, num1: int, is_batch: bool) -> Indices:
-    sizes = (num1, num0) if name == "matches1" else (num0, num1)
+def _read_indices(
+    place: str, name: str, array: Array, num_keypoints: tuple[int, int], is_batch: bool, may_be_short: bool
+) -> Indices:
+    sizes = num_keypoints[::-1] if name == "matches1" else num_keypoints
     per_keypoint = name in ("matches0", "matches1")
     # (1, 2) is one match, or one pair with two keypoints.
     has_batch_axis = array.ndim == 2 and len(array) == 1 and (per_keypoint or array.shape[1] != 2 or is_batch)
@@ -95,13 +98,13 @@ def _read_indices(place: str, name: str, array: Array, num0: int, num1: int, is_
     values = _whole_numbers(place, name, array)
     if of_both:
         rows = _one_pair(place, name, values, 2)
-        for view, size in enumerate((num0, num1)):
+        for view, size in enumerate(num_keypoints):
             _check_rows(place, name, rows[:, view], size, f"keypoints{view}")
         mask: Bool = np.all(rows >= 0, axis=1)
         kept = rows[mask]
         return Indices(kept[:, 0], kept[:, 1], mask.reshape(array.shape[:-1]))
     partner = _one_pair(place, name, values, 1)
-    if len(partner) > sizes[0]:
+    if len(partner) > sizes[0] or (len(partner) < sizes[0] and not may_be_short):
         view = int(name == "matches1")
         raise ValueError(f"{place}: {name} has {len(partner)} rows, but there are {sizes[0]} keypoints{view}")
     _check_rows(place, name, partner, sizes[1], "keypoints0" if name == "matches1" else "keypoints1")

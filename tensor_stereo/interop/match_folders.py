@@ -9,11 +9,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tensor_stereo.atomic import whole_file
+from tensor_stereo.atomic import append_line, drop_torn_line, whole_file
 from tensor_stereo.configs import FileFilterConfig, FilterConfig
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.match_lists import JOURNAL_FILE, SETTINGS_FILE, MatchFile, find_match_files
 from tensor_stereo.interop.verdicts import FilterSummary
+from tensor_stereo.locks import lock
+from tensor_stereo.paths import has_ending
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -79,49 +81,52 @@ def filter_files(
     source, out = Path(source), Path(out)
     files = find_match_files(source, out, None if keypoints is None else Path(keypoints))
     settings = {"config": asdict(config or FileFilterConfig()), "score_name": score_name}
-    _claim(out, json.loads(json.dumps(settings)))
-    known = _read_journal(out / JOURNAL_FILE)
     errors: dict[str, str] = {}
     total = FilterSummary()
     num_found = 0
     with (out / JOURNAL_FILE).open("ab", buffering=0) as journal:
+        if not lock(journal):
+            raise ValueError(f"out: another call works on {out}; wait for it or name another folder")
+        _claim(out, json.loads(json.dumps(settings)))
+        drop_torn_line(journal, out / JOURNAL_FILE)
+        known = _read_journal(out / JOURNAL_FILE)
         for number, file in enumerate(files):
-            stamp = _stamp(file)
+            result, stamp = out / file.name, _stamp(file)
             entry = known.get(file.name)
-            if entry is not None and entry["stamp"] == stamp and (out / file.name).is_file():
+            if entry is not None and entry["stamp"] == stamp and _size(result) == entry["size"]:
                 num_found += 1
                 total += FilterSummary(**entry["summary"])
             else:
                 try:
-                    total += _filter_one(file, out, stamp, score_name, config, journal.write)
-                except (ValueError, ImportError, OSError) as error:
+                    summary = _filter_one(file, result, score_name, config)
+                except (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError) as error:
                     if isinstance(error, OSError) and error.errno in _NO_ROOM:
                         raise
                     errors[file.name] = " ".join(str(error).split())
+                    if entry is not None:  # the result of what the file was
+                        result.unlink(missing_ok=True)
+                else:
+                    total += summary
+                    done = {"name": file.name, "stamp": stamp, "size": _size(result), "summary": asdict(summary)}
+                    append_line(json.dumps(done, separators=(",", ":")).encode(), journal)
             if on_progress is not None:
                 on_progress(number + 1, len(files), file.name)
     return FolderSummary(len(files), num_found, errors, total)
 
 
-def _filter_one(
-    file: MatchFile,
-    out: Path,
-    stamp: list[int],
-    score_name: str | None,
-    config: FilterConfig | None,
-    write: Callable[[bytes], Any],
-) -> FilterSummary:
-    has_names = file.source.suffix.casefold() not in (".h5", ".db")
-    summary = filter_file(
+def _filter_one(file: MatchFile, result: Path, score_name: str | None, config: FilterConfig | None) -> FilterSummary:
+    return filter_file(
         file.source,
-        out / file.name,
+        result,
         keypoints=file.keypoints,
-        score_name=score_name if has_names else None,
+        score_name=None if has_ending(file.source, (".h5", ".db")) else score_name,
         config=config,
     )
-    entry = {"name": file.name, "stamp": stamp, "summary": asdict(summary)}
-    write(json.dumps(entry, separators=(",", ":")).encode() + b"\n")
-    return summary
+
+
+def _size(path: Path) -> int | None:
+    """Bytes of a file; None if there is none."""
+    return path.stat().st_size if path.is_file() else None
 
 
 def _stamp(file: MatchFile) -> list[int]:
@@ -155,7 +160,7 @@ def _read_journal(path: Path) -> dict[str, dict[str, Any]]:
         try:
             entry = json.loads(line)
             FilterSummary(**entry["summary"])
-            entries[entry["name"]] = entry
+            entries[entry["name"]] = {"stamp": None, "size": None} | entry
         except (ValueError, TypeError, KeyError):
             continue
     return entries

@@ -40,9 +40,10 @@ def is_many(source: Path, out: Path) -> bool:
 def find_match_files(source: Path, out: Path, keypoints: Path | None = None) -> list[MatchFile]:
     """List the files of matches in a folder and below, or in a list of paths.
 
-    Hidden files and folders are passed over, and so are ``out`` and ``keypoints`` where they lie below ``source``. A
-    list is a CSV or Parquet table with the column ``matches`` and optionally ``keypoints``: paths that are absolute or
-    relative to the folder of the list.
+    Hidden files and folders are passed over, and so are ``out``, other folders of results and ``keypoints`` where they
+    lie below ``source``; links are followed, each folder once. A list is a CSV or Parquet table with the column
+    ``matches`` and optionally ``keypoints``: paths that are absolute or relative to the folder of the list. Their
+    results have the paths of the files below that folder, or below the one that all have in common.
 
     Args:
         source: The folder or the list.
@@ -67,24 +68,39 @@ def find_match_files(source: Path, out: Path, keypoints: Path | None = None) -> 
     else:
         check_source("source", source, TABLES)
         files = list(_read_list(source, keypoints))
-    seen: dict[str, Path] = {}
-    for file in files:
-        other = seen.setdefault(file.name, file.source)
-        if other is not file.source:
-            raise ValueError(f"source names two files whose result would be {file.name}: {other} and {file.source}")
-        if (out / file.name).resolve() == file.source.resolve():
-            raise ValueError(f"out must be another folder than source, whose file {file.source} it would replace")
+    _check_results(files, out, [source, *(() if keypoints is None else (keypoints,))])
     prepare_folder("out", out)
     return files
 
 
+def _check_results(files: list[MatchFile], out: Path, others: list[Path]) -> None:
+    """Raise if two results would have one name, or one would replace a file that is read."""
+    read = {path.resolve() for file in files for path in (file.source, file.keypoints) if path is not None}
+    read |= {path.resolve() for path in others}
+    seen: dict[str, Path] = {}
+    for file in files:
+        other = seen.setdefault(file.name, file.source)
+        if other is not file.source:
+            same = other.resolve() == file.source.resolve()
+            what = f"{other} twice" if same else f"{other} and {file.source}, whose results would have one name"
+            raise ValueError(f"source names {what}")
+        if (out / file.name).resolve() in read:
+            raise ValueError(f"out must be another folder than source, whose file {out / file.name} it would replace")
+
+
 def _walk(source: Path, out: Path, keypoints: Path | None) -> Iterator[MatchFile]:
     passed_over = {out.resolve(), *(() if keypoints is None else (keypoints.resolve(),))}
-    for folder, folders, names in os.walk(source):
+    visited: set[Path] = set()
+    for folder, folders, names in os.walk(source, followlinks=True):
         here = Path(folder)
-        folders[:] = sorted(
-            name for name in folders if not name.startswith(".") and (here / name).resolve() not in passed_over
-        )
+        real = here.resolve()
+        is_result = here != source and (here / SETTINGS_FILE).is_file()  # of another call
+        if real in visited or real in passed_over or is_result:
+            folders.clear()
+            if here != source:
+                continue
+        visited.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(names):
             path = here / name
             is_match_file = has_ending(path, tuple(FORMATS)) and not name.startswith(".")
@@ -117,12 +133,17 @@ def _read_list(source: Path, keypoints: Path | None) -> Iterator[MatchFile]:
     unknown = sorted(set(table.columns) - set(LIST_COLUMNS))
     if unknown:
         raise ValueError(f"{source} has the unknown column {unknown[0]!r}; known are {list(LIST_COLUMNS)}")
+    files = []
     for row, values in enumerate(table.iter_rows(named=True)):
         texts = {name: str(value).strip() for name, value in values.items() if value is not None}
         if not texts.get("matches"):
             place = f"line {row + 2}" if has_ending(source, ".csv") else f"row {row + 1}"
             raise ValueError(f"{source}, {place}: column 'matches' is empty")
-        path = source.parent / texts["matches"]
+        path = Path(os.path.normpath(source.absolute().parent / texts["matches"]))
         own = source.parent / texts["keypoints"] if texts.get("keypoints") else _keypoints_of(path, keypoints)
-        inside = path.is_relative_to(source.parent) and ".." not in path.parts
-        yield MatchFile(path.relative_to(source.parent).as_posix() if inside else path.name, path, own)
+        files.append((path, own))
+    folder = source.absolute().parent
+    if not all(path.is_relative_to(folder) for path, _ in files):  # then below the folder that all have in common
+        folder = Path(os.path.commonpath([path.parent for path, _ in files]))
+    for path, own in files:
+        yield MatchFile(path.relative_to(folder).as_posix(), path, own)

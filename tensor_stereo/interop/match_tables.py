@@ -9,14 +9,13 @@ import polars as pl
 import torch
 
 from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.interop.result_names import name_results, result_in
+from tensor_stereo.interop.result_names import earlier_results, name_results
 from tensor_stereo.interop.verdicts import (
     Array,
     FilterSummary,
     Int,
     MatchFilter,
     filter_matches,
-    is_score,
 )
 from tensor_stereo.ops.segments import check_range
 from tensor_stereo.paths import has_ending
@@ -53,10 +52,8 @@ def filter_table(source: Path, target: Path, run: MatchFilter, *, score_name: st
     verdicts = verdicts.take(np.argsort(order, kind="stable"))
     if set(_OF_CLASSIFY) <= set(table.columns):  # its verdicts are replaced by those of this filter
         table = table.drop("probability", "score", "inlier_score", *_OF_CLASSIFY, strict=False)
-    ours = _ours(table, score_name)
-    names = name_results(str(source), table.columns, ours=ours, score_name=score_name)
-    if verdicts.score is None:
-        table = table.drop(ours - {names.inlier, names.relation})
+    table = table.drop(_earlier(table))
+    names = name_results(str(source), table.columns, score_name)
     table = table.with_columns(
         pl.Series(names.inlier, verdicts.inlier),
         *([] if verdicts.score is None else [pl.Series(names.score, verdicts.score)]),
@@ -66,21 +63,13 @@ def filter_table(source: Path, target: Path, run: MatchFilter, *, score_name: st
     return FilterSummary().add(int(pair.max(initial=-1)) + 1, verdicts)
 
 
-def _ours(table: pl.DataFrame, score_name: str | None) -> set[str]:
+def _earlier(table: pl.DataFrame) -> list[str]:
     """The columns that an earlier filter wrote."""
-    names = [result_in(table.columns, name) for name in ("inlier", "relation")]
-    found = {name for name in names if name is not None}
-    if len(found) < len(names):
-        return set()
-    inlier, relation = (table[name].cast(pl.String, strict=False) for name in names)  # type: ignore[index]
-    if not relation.is_in(list(_RELATIONS.values())).all() or not inlier.is_in(["true", "false"]).all():
-        return set()
-    untested = (relation == "untested").to_numpy()
-    for name in ("score", score_name):
-        if name in table.columns:
-            values = table[name].cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
-            found |= {name} if name and is_score(values, untested) else set()
-    return found
+    for names in earlier_results(table.columns):
+        inlier, relation = (table[name].cast(pl.String, strict=False) for name in (names.inlier, names.relation))
+        if inlier.is_in(["true", "false"]).all() and relation.is_in(list(_RELATIONS.values())).all():
+            return [name for name in names if name]
+    return []
 
 
 def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
@@ -93,9 +82,11 @@ def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
     if pair.has_nulls():
         raise ValueError(f"{_line(source, pair.is_null().arg_max() or 0)}: column 'pair' is empty")
     if not pair.dtype.is_integer():
-        pair = pair.cast(pl.String)
-    numbers: Int = pair.rank("dense").to_numpy().astype(np.int64) - 1
-    return numbers
+        pair = pair.cast(pl.String).str.strip_chars()
+        numbers = _whole(pair.cast(pl.Float64, strict=False))
+        pair = pair if numbers.has_nulls() else numbers  # 1 and 1.0 are one pair
+    ranks: Int = pair.rank("dense").to_numpy().astype(np.int64) - 1
+    return ranks
 
 
 def _to_matches(

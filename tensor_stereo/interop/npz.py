@@ -8,7 +8,7 @@ import shutil
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
@@ -16,10 +16,9 @@ from tokenize import TokenError
 import numpy as np
 
 from tensor_stereo.interop.npz_forms import Header, find_form, form_matches
-from tensor_stereo.interop.result_names import name_results, result_in
-from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, filter_matches, is_score
+from tensor_stereo.interop.result_names import earlier_results, name_results
+from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, filter_matches
 from tensor_stereo.limits import MAX_ROWS
-from tensor_stereo.types import Relation
 
 _HEADER_BYTES = 10_000  # what NumPy itself accepts of a header, by default
 _MAX_RATIO = 1032  # of deflate, by its format
@@ -47,15 +46,15 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
                 return _read_array(source, archive, members[name][0])
 
             arrays = {name: read(name) for name in form.arrays}
-            ours = _ours(members, read, score_name)
-            names = name_results(str(source), members, ours=ours, score_name=score_name)
+            ours = _earlier(members)
+            names = name_results(str(source), members.keys() - ours, score_name)
             read_pairs = form_matches(str(source), form, arrays)
             verdicts = filter_matches(read_pairs.matches, run)
             kind = members[form.points0][0].compress_type
             results = dict(zip(names, read_pairs.lay_out(verdicts), strict=True))
             with zipfile.ZipFile(target, "w", kind) as result:
                 for name, (info, _) in members.items():
-                    if results.get(name) is None and name not in ours:
+                    if name not in ours:
                         _copy_member(archive, info, result)
                 for name, values in results.items():
                     if values is not None:
@@ -84,19 +83,13 @@ def is_rectified(source: Path) -> bool:
         return True
 
 
-def _ours(
-    members: Mapping[str, tuple[zipfile.ZipInfo, Header]], read: Callable[[str], Array], score_name: str | None
-) -> set[str]:
-    """The results in an archive that an earlier filter wrote."""
-    inlier, relation = (result_in(members, name) for name in ("inlier", "relation"))
-    if inlier is None or relation is None:
-        return set()
-    headers = {name: members[name][1] for name in (inlier, relation)}
-    if headers[inlier].dtype != bool or headers[relation] != (headers[inlier].shape, np.dtype(np.int8)):
-        return set()
-    untested = read(relation) == Relation.UNTESTED
-    scores = [name for name in ("score", score_name) if name in members]
-    return {*headers, *(name for name in scores if name and is_score(read(name), untested))}
+def _earlier(members: Mapping[str, tuple[zipfile.ZipInfo, Header]]) -> set[str]:
+    """The arrays that an earlier filter wrote."""
+    for names in earlier_results(list(members)):
+        inlier, relation = (members[name][1] for name in (names.inlier, names.relation))
+        if inlier.dtype == np.bool_ and relation == (inlier.shape, np.dtype(np.int8)):
+            return {name for name in names if name}
+    return set()
 
 
 def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, tuple[zipfile.ZipInfo, Header]]:
@@ -116,8 +109,9 @@ def _check_members(source: Path, archive: zipfile.ZipFile) -> dict[str, tuple[zi
         if info.header_offset < 0 or num_bytes_left < 0 or info.file_size > _MAX_RATIO * info.compress_size:
             raise ValueError(f"{place} claims {info.file_size} bytes, which the archive cannot hold")
         shape, dtype, header_bytes = _read_header(place, archive, info)
-        if dtype.hasobject:
-            raise ValueError(f"{place} holds Python objects, which are not loaded; save it with a plain dtype")
+        if dtype.hasobject:  # of a size that only unpickling would tell; it is copied as it is, if nobody reads it
+            members[name] = info, Header(shape, dtype)
+            continue
         num_bytes = math.prod(shape) * dtype.itemsize
         if header_bytes + num_bytes != info.file_size:
             held = f"holds {info.file_size - header_bytes}"
@@ -150,7 +144,9 @@ def _read_header(
 def _read_array(source: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Array:
     """One array whose header and size were checked."""
     place = f"{source}, array {info.filename.removesuffix('.npy')!r}"
-    shape, _, _ = _read_header(place, archive, info)
+    shape, dtype, _ = _read_header(place, archive, info)
+    if dtype.hasobject:
+        raise ValueError(f"{place} holds Python objects, which are not loaded; save it with a plain dtype")
     if max(shape, default=0) > MAX_ROWS:
         raise ValueError(f"{place} must have at most {MAX_ROWS} rows, got {max(shape)}")
     with archive.open(info) as member:

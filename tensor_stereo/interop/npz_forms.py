@@ -14,8 +14,9 @@ the same with ``matches`` (N0,) or (S, 2)               older SuperGlue, LightGl
                                                         ``confidence``
 ======================================================  ===============================================================
 
-Rows of both views are matches only where nothing says otherwise: an array whose name says that it holds indices, and
-which is none of these, is refused by name. Arrays may have a batch axis of one.
+Rows of both views are matches only where nothing says otherwise: an array of integers with an entry per keypoint or
+two per match, or one whose name speaks of matches, is refused by name if it is none of these, unless ``ptr`` says that
+rows are matches. Arrays may have a batch axis of one.
 """
 
 from __future__ import annotations
@@ -29,16 +30,20 @@ import numpy as np
 import torch
 
 from tensor_stereo.interop.index_arrays import INDEX_ARRAYS, Indices, index_matches
+from tensor_stereo.interop.result_names import earlier_results
 from tensor_stereo.interop.verdicts import Array, Int, Verdicts
 from tensor_stereo.ops.segments import check_range
 from tensor_stereo.types import Matches
 
 _POINTS = ("keypoints0", "keypoints1")
 _ROWS = (_POINTS, ("mkpts0", "mkpts1"), ("mkpts0_f", "mkpts1_f"))
+_COARSE = ("mkpts0_c", "mkpts1_c", "mkpts0_f", "mkpts1_f", "i_ids", "j_ids", "b_ids", "m_bids", "gt_mask")  # of LoFTR
 _BATCH = ("batch_indexes", "m_bids", "b_ids")  # the pair of each row
 _CONFIDENCE = ("confidence", "mconf")
 _RAGGED = ("ptr", "cost", "group")  # of this library's own form
-_SAYS_INDEX = re.compile(r"match|mkpt|kpts|corr|ind(ex|ices)|idx|assign|partner|bids|b_ids|batch", re.IGNORECASE)
+# Names of arrays that say which rows are matches, whatever they hold; but not how good a match is.
+_SAYS_MATCH = re.compile(r"match|mkpt|kpts|idx|partner|mask|b_?ids", re.IGNORECASE)
+_SAYS_QUALITY = re.compile(r"score|conf|prob|dist|sim|cost", re.IGNORECASE)
 
 
 class Header(NamedTuple):
@@ -117,7 +122,13 @@ def find_form(place: str, headers: Mapping[str, Header]) -> Form:
     if batch is not None and "ptr" in headers:
         raise ValueError(f"{place} holds the pair of each row twice, as 'ptr' and as {batch!r}; leave one of them out")
     arrays = (*views, *of_ours, *of_others)
-    _refuse_unread(place, headers, {*arrays, *(_POINTS if has_plain else ())}, has_matched)
+    if "ptr" not in headers:  # it says that rows are matches
+        ours = {name for names in earlier_results(list(headers)) for name in names}
+        known = {*arrays, *ours, *(_POINTS if has_plain else ()), *(_COARSE if has_matched else ())}
+        num_keypoints = {
+            length for name in (*_POINTS, *views) if name in headers for length in headers[name].shape[:-1]
+        }
+        _refuse_unread(place, headers, known, tuple(num_keypoints - {1}))
     return Form(*views, arrays, has_indices=False, is_rectified=not (has_matched or of_others))
 
 
@@ -133,18 +144,20 @@ def _indexed_form(place: str, headers: Mapping[str, Header]) -> Form:
     return Form(*_POINTS, (*_POINTS, *indices, *scores), has_indices=True, is_rectified=False)
 
 
-def _refuse_unread(place: str, headers: Mapping[str, Header], known: set[str], has_matched: bool) -> None:
-    """Raise for an array that seems to say which rows are matches."""
+def _refuse_unread(place: str, headers: Mapping[str, Header], known: set[str], num_keypoints: tuple[int, ...]) -> None:
+    """Raise for an array that may say which rows are matches: by its name, or by integers per row or two per match."""
     for name, header in headers.items():
-        is_points = "mkpt" in name.casefold() and not has_matched
-        if name in known or name.startswith("gt_") or not _SAYS_INDEX.search(name):
+        shape = header.shape[1:] if header.shape[:1] == (1,) and len(header.shape) > 1 else header.shape
+        is_index = (len(shape) == 1 and shape[0] in num_keypoints) or (len(shape) == 2 and 2 in shape)
+        by_name = _SAYS_MATCH.search(name) and not _SAYS_QUALITY.search(name)
+        is_points = "mkpt" in name.casefold() and "mkpts0" not in known and "mkpts0_f" not in known
+        if name in known or not (is_points or (is_index and (by_name or header.dtype.kind in "iu"))):
             continue
-        if (header.dtype.kind in "iub" and header.shape) or is_points:
-            read = ", ".join((*INDEX_ARRAYS, *_BATCH, "mkpts0 with mkpts1"))
-            raise ValueError(
-                f"{place} pairs the rows of its keypoints, but the array {name!r} may say otherwise and is not read; "
-                f"read are {read}. Rename it to one of these or leave it out"
-            )
+        raise ValueError(
+            f"{place} pairs the rows of its keypoints, but the array {name!r} may say otherwise. Read are "
+            f"{', '.join((*INDEX_ARRAYS, *_BATCH))} and mkpts0 with mkpts1; rename or leave out the array, or add "
+            "ptr = [0, M] to say that the rows are the M matches of one pair"
+        )
 
 
 def form_matches(place: str, form: Form, arrays: Mapping[str, Array]) -> ReadPairs:

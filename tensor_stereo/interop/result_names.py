@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import re
+from collections.abc import Collection, Iterator, Sequence
+from itertools import count
 from typing import NamedTuple
 
-RESULTS = ("inlier", "score", "relation")
+_INLIER, _RELATION = (re.compile(rf"(filter_)?{name}(_\d+)?") for name in ("inlier", "relation"))
 
 
 class ResultNames(NamedTuple):
@@ -16,54 +18,64 @@ class ResultNames(NamedTuple):
     relation: str = "relation"
 
 
-def name_results(
-    place: str, taken: Collection[str], *, ours: Collection[str] = (), score_name: str | None = None
-) -> ResultNames:
+def earlier_results(names: Sequence[str]) -> Iterator[ResultNames]:
+    """Where results of an earlier filter may stand: it writes inlier, score and relation one after the other.
+
+    Args:
+        names: Of the columns or arrays of a file, in their order.
+
+    Yields:
+        Names whose values can be results; ``score`` is empty where there was none.
+
+    >>> list(earlier_results(["x0", "score", "inlier", "filter_score", "relation"]))
+    [ResultNames(inlier='inlier', score='filter_score', relation='relation')]
+    """
+    for k, name in enumerate(names):
+        for length in (1, 2):
+            if k + length < len(names) and _INLIER.fullmatch(name) and _RELATION.fullmatch(names[k + length]):
+                yield ResultNames(name, names[k + 1] if length == 2 else "", names[k + length])
+
+
+def name_results(place: str, taken: Collection[str], score_name: str | None = None) -> ResultNames:
     """Choose names that leave every column or array of the user's alone.
 
-    The names are ``inlier``, ``score`` and ``relation``. Where the file has something else of such a name, the result
-    is called ``filter_inlier``, ``filter_score`` or ``filter_relation``.
+    The names are ``inlier``, ``score`` and ``relation``. Where the file has something of such a name, the result is
+    called ``filter_inlier``, ``filter_score`` or ``filter_relation``, with a number if that is taken too.
 
     Args:
         place: File, for errors.
-        taken: Names in the file.
-        ours: Those of ``RESULTS`` in the file that an earlier filter wrote, so that they are replaced.
-        score_name: Name of the score that the user asks for; it must be a new one, or one of ours.
+        taken: Names in the file, without those of an earlier filter, which are replaced.
+        score_name: Name of the score that the user asks for.
 
     Raises:
-        ValueError: If the file has something else of the name ``score_name``.
+        ValueError: If the file has something of the name ``score_name``.
 
     >>> name_results("a.csv", ["x0", "score"])
     ResultNames(inlier='inlier', score='filter_score', relation='relation')
     """
-    chosen = {}
-    for name in RESULTS:
-        other = f"filter_{name}"
-        is_free = name not in taken or (name in ours and other not in taken)
-        chosen[name] = name if is_free else other
+    if score_name in taken:
+        raise ValueError(f"score_name must be a new name in {place}, which has {score_name!r}")
+    chosen = [next(other for other in _candidates(name) if other not in taken) for name in ResultNames()]
     if score_name is not None:
-        if score_name in taken and score_name not in (*ours, "filter_score"):
-            raise ValueError(f"score_name must be a new name in {place}, which has {score_name!r}")
-        chosen["score"] = score_name
-    return ResultNames(**chosen)
+        chosen[1] = score_name
+    return ResultNames(*chosen)
 
 
-def result_in(taken: Collection[str], name: str) -> str | None:
-    """The name that a result of an earlier filter would have among the names of a file.
-
-    >>> result_in(["inlier", "filter_inlier"], "inlier"), result_in(["inlier"], "inlier"), result_in([], "inlier")
-    ('filter_inlier', 'inlier', None)
-    """
-    return next((other for other in (f"filter_{name}", name) if other in taken), None)
+def _candidates(name: str) -> Iterator[str]:
+    yield name
+    yield f"filter_{name}"
+    yield from (f"filter_{name}_{number}" for number in count(2))
 
 
 def check_score_name(score_name: str | None) -> None:
     """Raise unless a name of the score can be one of a column.
 
     Raises:
-        ValueError: If it is empty or the name of another result.
+        ValueError: If it is empty, or would be taken for the name of another result.
 
     >>> check_score_name("confidence")
     """
-    if score_name is not None and (not score_name.strip() or score_name in ("inlier", "relation")):
+    if score_name is None:
+        return
+    if not score_name.strip() or _INLIER.fullmatch(score_name) or _RELATION.fullmatch(score_name):
         raise ValueError(f"score_name must be the name of a column besides inlier and relation, got {score_name!r}")

@@ -83,17 +83,6 @@ def _spread(values: Array, mask: Bool) -> Array:
     return wide
 
 
-def is_score(values: Array, untested: Bool) -> bool:
-    """Whether values can be a score that a filter wrote: numbers in [0, 1], and 0 for what was untested.
-
-    >>> is_score(np.array([0.0, 0.5]), np.array([True, False])), is_score(np.array([7, 8]), np.array([True, False]))
-    (True, False)
-    """
-    if values.shape != untested.shape or values.dtype.kind != "f":
-        return False
-    return bool(((values >= 0) & (values <= 1)).all() and not values[untested].any())
-
-
 def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
     """Run a filter over a batch, in blocks of whole pairs with about ``BLOCK_MATCHES`` matches.
 

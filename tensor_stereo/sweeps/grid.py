@@ -54,7 +54,7 @@ def read_grid(path: Path | str) -> SweepConfig:
         text = path.read_text(encoding="utf-8")
         _check_dots(text)
         document = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML file: {error}") from error
     try:
         unknown = sorted(document.keys() - set(_TOP))

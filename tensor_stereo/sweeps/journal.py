@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from tensor_stereo.atomic import flush_file
-from tensor_stereo.sweeps.locks import lock
+from tensor_stereo.atomic import append_line, drop_torn_line
+from tensor_stereo.locks import lock
 
 LOG = logging.getLogger(__name__)
 
@@ -100,15 +98,7 @@ def append(entry: dict[str, Any], journal: IO[bytes]) -> None:
     Raises:
         OSError: if it cannot be written.
     """
-    line = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
-    end = os.fstat(journal.fileno()).st_size
-    try:
-        if journal.write(line) != len(line):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), journal.name)
-        flush_file(journal.fileno())
-    except OSError:
-        journal.truncate(end)
-        raise
+    append_line(json.dumps(entry, separators=(",", ":")).encode(), journal)
 
 
 @contextmanager
@@ -129,8 +119,7 @@ def open_journal(out: Path, shard: tuple[int, int]) -> IO[bytes]:
     journal = path.open("ab", buffering=0)
     try:
         _lock_journal(journal, path)
-        data = path.read_bytes()
-        journal.truncate(data.rfind(b"\n") + 1)
+        drop_torn_line(journal, path)
     except BaseException:
         journal.close()
         raise

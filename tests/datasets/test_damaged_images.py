@@ -60,3 +60,15 @@ def test_a_header_that_claims_gigabytes_is_refused_before_decoding(tmp_path, kin
         ValueError, match=r"must have at most 67108864 pixels, its header says (40000 x 40000|32767 x 3)"
     ):
         read_image(write(tmp_path / f"im0.{kind}", content))
+
+
+def test_a_float_map_with_signalling_nan_is_unknown_there(tmp_path, recwarn):
+    from tensor_stereo.datasets import PairFiles, read_pair
+
+    values = struct.pack("<4I", 0x7F800001, 0x7F000000, 0x3F800000, 0xFF800000)  # signalling NaN, 1.7e38, 1, -inf
+    disparity = write(tmp_path / "d.PFM", b"Pf\n4 1\n-1\n" + values)
+    view = write(tmp_path / "im.pgm", b"P5 4 1 255 1234")
+    found = read_pair(PairFiles("a", "b", view, view, disparity, 0.1)).disparity_gt
+    assert found.isnan().tolist() == [[True, True, False, True]]
+    assert found[0, 2] == 10
+    assert not recwarn.list

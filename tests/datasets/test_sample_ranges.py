@@ -120,6 +120,14 @@ def test_tiff_is_scaled_by_its_bits(tmp_path, bits, order, big):
     assert read_disparity_png(path, 1)[0, 1:].tolist() == samples[1:]
 
 
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_tiff_whose_zero_is_white_is_turned_over(tmp_path, bits):
+    largest = 2**bits - 1
+    samples = [0, largest // 3, largest]
+    path = write(tmp_path / "a.tif", tiff(samples, bits, tags={262: 0}))
+    assert read_image(path).flatten().tolist() == [to_8_bits(largest - value, largest) for value in samples]
+
+
 def test_tiff_of_16_bits_is_scaled_by_a_largest_sample_that_is_a_range(tmp_path):
     samples = [0, 1000, 4095]
     image = read_image(write(tmp_path / "a.tif", tiff(samples, 16, tags={281: 4095})))

@@ -237,7 +237,7 @@ def test_damaged_and_unfinished_databases_are_refused(pycolmap: Any, tmp_path: P
     source.write_bytes(data)
     with closing(pycolmap.Database.open(str(source))) as database:
         database.write_matches(2, 2, rows_of(0, 4))
-        with pytest.raises(ValueError, match=r"in\.db is not finished, part of it is in in\.db-wal"):
+        with pytest.raises(ValueError, match=r"in\.db is not finished, see in\.db-wal"):
             filter_colmap(source, target, two_view_filter())
     assert filter_colmap(source, target, two_view_filter()).num_pairs == 4
 

@@ -12,7 +12,7 @@ import torch
 from tensor_stereo import Matches, filter_file
 from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.hdf5_matches import filter_hdf5
-from tests.interop.hloc_files import IMAGES, features, paths
+from tests.interop.hloc_files import IMAGES, features, paths, write_features, write_matches
 from tests.interop.match_batches import expected_of_any_views
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed")
@@ -214,3 +214,59 @@ def test_wrong_exports_are_named_by_pair(tmp_path: Path, change: Any, message: s
         change(file["a/b"])
     with pytest.raises(ValueError, match=message):
         filter_file(source, target)
+
+
+def test_datasets_of_the_user_survive(tmp_path: Path) -> None:
+    source, target, _ = paths(tmp_path)
+    write_exported(source, {"a/b": 0})
+    users = {"score": np.linspace(0, 1, 50), "inlier": np.arange(50)}
+    with h5py.File(source, "r+") as file:
+        for name, values in users.items():
+            file["a/b"][name] = values
+    for score in ("consensus", "none", "consensus"):
+        filter_hdf5(source, target, two_view_filter(score=score), None)
+        target.replace(source)
+        with h5py.File(source, "r") as file:
+            group = file["a/b"]
+            for name, values in users.items():
+                np.testing.assert_array_equal(group[name][()], values)
+            assert ("filter_score" in group) == (score != "none")
+            assert {"filter_inlier", "relation"} <= set(group)
+
+
+def test_attributes_of_the_user_survive(tmp_path: Path) -> None:
+    source, target, keypoints = paths(tmp_path)
+    write_disk_keypoints(keypoints, 4)
+    write_disk_matches(source, disk_pairs(4), "int64", in_rows=False)
+    with h5py.File(source, "r+") as file:
+        file["1/2"].attrs["score"] = 0.5
+    for _ in range(2):
+        filter_hdf5(source, target, two_view_filter(), keypoints)
+        target.replace(source)
+    with h5py.File(source, "r") as file:
+        attributes = file["1/2"].attrs
+        assert attributes["score"] == 0.5
+        assert len(attributes["filter_score"]) == len(attributes["inlier"])
+
+
+def test_dense_matches_of_hloc_need_the_file_of_features(tmp_path: Path) -> None:
+    """``match_dense.py`` leaves the keypoints of the dense matcher beside matches of the aggregated ones."""
+    source, target, keypoints = paths(tmp_path)
+    given = features(0)
+    write_features(keypoints, given)
+    matches0 = np.arange(50)
+    write_matches(source, {IMAGES[:2]: {"matches0": matches0, "matching_scores0": np.ones(50)}})
+    filter_file(source, target, keypoints=keypoints)
+    with h5py.File(target, "r") as file:
+        expected = file["db-1.jpg/db-2.jpg/matches0"][()]
+    with h5py.File(source, "r+") as file:
+        group = file["db-1.jpg/db-2.jpg"]
+        for view in (0, 1):
+            group[f"keypoints{view}"] = np.random.default_rng(view).uniform(0, 300, (80, 2))
+        group["scores"] = np.ones(80)
+    with pytest.raises(ValueError, match="keypoints must be given for files of hloc and DISK"):
+        filter_file(source, target)
+    filter_file(source, target, keypoints=keypoints)
+    with h5py.File(target, "r") as file:
+        np.testing.assert_array_equal(file["db-1.jpg/db-2.jpg/matches0"][()], expected)
+    assert (expected >= 0).any()

@@ -155,7 +155,7 @@ def test_what_is_wrong_is_named_by_file_and_pair(tmp_path: Path, change: Any, me
     assert not (tmp_path / "other.h5").exists()
 
 
-def test_links_in_place_of_the_results_are_replaced_and_not_followed(tmp_path: Path) -> None:
+def test_links_with_names_of_results_stay_and_are_not_followed(tmp_path: Path) -> None:
     source, target, keypoints = paths(tmp_path)
     write_features(keypoints, features(8))
     write_matches(source, {(IMAGES[0], IMAGES[1]): partners(8)})
@@ -169,7 +169,9 @@ def test_links_in_place_of_the_results_are_replaced_and_not_followed(tmp_path: P
     assert (tmp_path / "other.h5").read_bytes() == before
     with h5py.File(target) as result:
         group = result["db-1.jpg/db-2.jpg"]
-        assert all(isinstance(group.get(name, getlink=True), h5py.HardLink) for name in ("score", "inlier"))
+        for name in ("score", "inlier"):
+            assert isinstance(group.get(name, getlink=True), h5py.ExternalLink)
+            assert isinstance(group.get(f"filter_{name}", getlink=True), h5py.HardLink)
 
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:

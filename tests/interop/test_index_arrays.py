@@ -117,7 +117,7 @@ def test_a_matcher_that_is_not_mutual_may_leave_matches1_short() -> None:
 
 @pytest.mark.parametrize(
     ("other", "values"),
-    [("matches1", [-1, 3, -1]), ("matches", [[0, 1]]), ("matches01", [0, 1, -1])],
+    [("matches1", [-1, 3, -1]), ("matches", [[0, 1]]), ("matches01", [0, 1, -1, -1])],
 )
 def test_index_arrays_that_disagree_are_named(other: str, values: list[int]) -> None:
     arrays = {"keypoints0": np.eye(4)[:, :2], "keypoints1": np.eye(3)[:, :2], "matches0": np.array([0, -1, -1, -1])}
@@ -128,7 +128,10 @@ def test_index_arrays_that_disagree_are_named(other: str, values: list[int]) -> 
 def test_unmatched_keypoints_and_scores_may_hold_anything() -> None:
     points = np.array([[0.0, 1.0], [np.nan, np.inf], [2.0, 5.0]])
     arrays = {"keypoints0": points, "keypoints1": points, "matches0": np.array([2, -1])}
-    picked, _ = index_matches("m", arrays | {"matching_scores0": np.array([0.25, np.nan])})
+    with pytest.raises(ValueError, match="m: matches0 has 2 rows, but there are 3 keypoints0"):
+        index_matches("m", arrays)
+    scores = {"matching_scores0": np.array([0.25, np.nan])}
+    picked, _ = index_matches("m", arrays | scores, may_be_short=True)
     assert picked.keypoints1.tolist() == [[2.0, 5.0]]
     assert picked.cost is not None
     assert picked.cost.tolist() == [0.75]

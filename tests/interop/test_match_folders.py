@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from tensor_stereo import filter_file, filter_files
 from tensor_stereo.cli import main
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.interop import match_folders
+from tensor_stereo.locks import lock
 from tests.awkward_names import NAMES
 from tests.cli.failing import fails
 from tests.interop.match_batches import batch
@@ -77,11 +79,95 @@ def test_a_second_call_does_only_what_is_left(source: Path, tmp_path: Path, monk
     (out / "deep [1]" / "b.PARQUET").unlink()  # lost
     journal = out / "filter.jsonl"
     journal.write_bytes(journal.read_bytes() + b'{"name": "torn')
+    (out / GOOD[2]).write_bytes(b"")  # cut off
     done.clear()
     filter_files(source, out, config=SETTINGS)
-    assert done == ["a.csv", "damaged.npz", "deep [1]/b.PARQUET"]
+    assert done == ["a.csv", "damaged.npz", *GOOD[1:]]
+    done.clear()
+    filter_files(source, out, config=SETTINGS)
+    assert done == ["damaged.npz"]
     filter_file(source / "a.csv", tmp_path / "alone.csv", config=SETTINGS)
     assert (out / "a.csv").read_bytes() == (tmp_path / "alone.csv").read_bytes()
+
+
+def test_the_result_of_a_file_that_fails_now_does_not_stay(source: Path, tmp_path: Path) -> None:
+    filter_files(source, tmp_path / "out", config=SETTINGS)
+    (source / "a.csv").write_text("x0,y0\n")
+    assert set(filter_files(source, tmp_path / "out", config=SETTINGS).errors) == {"a.csv", "damaged.npz"}
+    assert not (tmp_path / "out" / "a.csv").exists()
+
+
+def test_two_calls_on_one_folder_are_refused(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with (tmp_path / "out" / "filter.jsonl").open("ab") as journal:
+        assert lock(journal)
+        with pytest.raises(ValueError, match="out: another call works on"):
+            filter_files(source, tmp_path / "out", config=SETTINGS)
+
+
+def test_whatever_one_file_does_the_others_are_done(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for error in (TypeError, RuntimeError, MemoryError, PermissionError):
+
+        def failing(path: Path, *arguments: object, error: type[Exception] = error, **settings: object) -> object:
+            if path.name == "a.csv":
+                raise error("of its own kind")
+            return filter_file(path, *arguments, **settings)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(match_folders, "filter_file", failing)
+        summary = filter_files(source, tmp_path / error.__name__, config=SETTINGS)
+        assert set(summary.errors) == {"a.csv", "damaged.npz"}
+        assert (tmp_path / error.__name__ / GOOD[1]).exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of files are text on this system")
+def test_names_that_are_no_text_are_no_end(source: Path, tmp_path: Path) -> None:
+    for ending in (".csv", ".parquet"):
+        table = table_of(batch(1))
+        with open(os.fsencode(source) + b"/caf\xe9" + ending.encode(), "wb") as file:  # noqa: PTH123
+            table.write_csv(file) if ending == ".csv" else table.write_parquet(file)
+    assert list(filter_files(source, tmp_path / "out", config=SETTINGS).errors) == ["damaged.npz"]
+
+
+def test_links_are_followed_and_results_of_other_calls_passed_over(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copy(source / "a.csv", tmp_path / "elsewhere" / "linked.csv")
+    (source / "link").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    (source / "loop").symlink_to(source, target_is_directory=True)
+    filter_files(source, source / "first", config=SETTINGS)
+    summary = filter_files(source, source / "second", config=SETTINGS)
+    assert summary.num_files == 5
+    assert (source / "second" / "link" / "linked.csv").exists()
+
+
+def test_no_result_replaces_another_source(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inner = source / "sub"
+    inner.mkdir()
+    shutil.copy(source / "a.csv", inner / "a.csv")
+    (source / "list.csv").write_text("matches\na.csv\nsub/a.csv\n")
+    before = contents(source)
+    fails(["filter", str(source / "list.csv"), "--out", str(inner)], capsys, "--out must be another folder")
+    (source / "list.csv").unlink()
+    deep = source / "deep" / "deep"
+    deep.mkdir(parents=True)
+    for folder in (deep, deep.parent):
+        shutil.copy(source / "a.csv", folder / "x.csv")
+    fails(["filter", str(source / "deep"), "--out", str(source)], capsys, "--out must be another folder")
+    assert {name: data for name, data in contents(source).items() if name in before} == {
+        name: data for name, data in before.items() if name != "list.csv"
+    }
+
+
+def test_a_list_may_name_equal_files_in_several_folders(source: Path, tmp_path: Path) -> None:
+    folders = [tmp_path / "scenes" / name for name in ("A", "B")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        shutil.copy(source / "a.csv", folder / "m.csv")
+    (source / "list.csv").write_text("matches\n" + "\n".join(str(folder / "m.csv") for folder in folders))
+    assert filter_files(source / "list.csv", tmp_path / "out", config=SETTINGS).errors == {}
+    assert (tmp_path / "out" / "A" / "m.csv").exists()
+    assert (tmp_path / "out" / "B" / "m.csv").exists()
 
 
 def test_an_interrupted_call_goes_on(source: Path, tmp_path: Path) -> None:
@@ -112,15 +198,20 @@ def test_a_list_names_files_wherever_they_are(source: Path, tmp_path: Path, endi
 
     elsewhere = tmp_path / "elsewhere.csv"
     shutil.copy(source / "a.csv", elsewhere)
-    names = ["deep [1]/seed=3/c.npz", str(elsewhere), " a.csv", "missing.npz"]
+    names = ["deep [1]/seed=3/c.npz", " a.csv", "missing.npz"]
     table = pl.DataFrame({"matches": names})
     path = source / f"list{ending}"
     table.write_csv(path) if ending == ".csv" else table.write_parquet(path)
     summary = filter_files(path, tmp_path / "out", config=SETTINGS)
-    assert set(contents(tmp_path / "out")) == {
-        *("deep [1]/seed=3/c.npz", "elsewhere.csv", "a.csv", "filter.json", "filter.jsonl")
-    }
+    assert set(contents(tmp_path / "out")) == {*("deep [1]/seed=3/c.npz", "a.csv", "filter.json", "filter.jsonl")}
     assert list(summary.errors) == ["missing.npz"]
+    names[1] = str(elsewhere)
+    table = pl.DataFrame({"matches": names})
+    table.write_csv(path) if ending == ".csv" else table.write_parquet(path)
+    filter_files(path, tmp_path / "other", config=SETTINGS)
+    assert set(contents(tmp_path / "other")) == {
+        *("matches/deep [1]/seed=3/c.npz", "elsewhere.csv", "filter.json", "filter.jsonl")
+    }
 
 
 def test_hdf5_files_take_the_common_keypoints_where_they_have_none(tmp_path: Path) -> None:
@@ -158,7 +249,7 @@ def empty_folder(folder: Path) -> Path:
         (change_list("x0,y0,x1,y1\n"), "MATCHES must be a list with the column 'matches' where out is a folder"),
         (change_list("matches,note\na.csv,b\n"), "unknown column 'note'"),
         (change_list("matches,keypoints\n,k.h5\n"), "line 2: column 'matches' is empty"),
-        (change_list("matches\na.csv\n../matches/a.csv\n"), "two files whose result would be a.csv"),
+        (change_list("matches\na.csv\n../matches/a.csv\n"), "twice"),
         (lambda folder: folder / "none", "MATCHES"),
     ],
 )

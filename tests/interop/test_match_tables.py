@@ -270,17 +270,20 @@ def test_columns_of_the_user_are_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_score_of_the_user_survives_filters(tmp_path: Path, ending: str) -> None:
-    users = [float(k - 3) for k in range(40)]
+    """Also one that could be ours, through filters with and without a score."""
+    users = [k / 50 + 0.1 for k in range(40)]
     table = table_of(batch(3, [40]))
     plain = filtered(tmp_path, table, ending)
     own = table.with_columns(pl.Series("score", users), pl.lit("mine").alias("relation"))
-    for _ in range(2):  # the second time on what the first has written
-        own = filtered_as(tmp_path, own, ending)
+    for score in ("consensus", "none", "consensus", "consensus"):
+        own = filtered_as(tmp_path, own, ending, score=score)
         assert own["score"].cast(pl.Float64).to_list() == users
         assert own["relation"].to_list() == ["mine"] * 40
         assert own["filter_relation"].to_list() == plain["relation"].to_list()
-        assert own["filter_score"].cast(pl.Float64).to_list() == plain["score"].to_list()
-        assert own.columns == [*table.columns, "score", "relation", "inlier", "filter_score", "filter_relation"]
+        scored = ["filter_score"] if score != "none" else []
+        assert own.columns == [*table.columns, "score", "relation", "inlier", *scored, "filter_relation"]
+        if scored:
+            assert own["filter_score"].cast(pl.Float64).to_list() == plain["score"].to_list()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -295,10 +298,12 @@ def test_the_name_of_the_score_can_be_chosen(tmp_path: Path, ending: str) -> Non
         filtered_as(tmp_path, table, ending, score_name="x0")
 
 
-def filtered_as(folder: Path, table: pl.DataFrame, ending: str, score_name: str | None = None) -> pl.DataFrame:
+def filtered_as(
+    folder: Path, table: pl.DataFrame, ending: str, score_name: str | None = None, score: str = "consensus"
+) -> pl.DataFrame:
     source, target = folder / f"in{ending}", folder / f"out{ending}"
     table_files.write_table(table, source)
-    filter_table(source, target, two_view_filter(), score_name=score_name)
+    filter_table(source, target, two_view_filter(score=score), score_name=score_name)
     return table_files.read_csv(target) if ending == ".csv" else table_files.read_parquet(target)
 
 
@@ -323,3 +328,15 @@ def test_a_group_that_is_no_integer_is_named(tmp_path: Path, value: str) -> None
     (tmp_path / "in.csv").write_text(f"{HEADER},group\n1,2,3,4,2.0\n1,2,3,4,{value}\n")
     with pytest.raises(ValueError, match=r"in\.csv, line 3: column 'group' (must be an integer|is empty)"):
         filter_table(tmp_path / "in.csv", tmp_path / "out.csv", two_view_filter())
+
+
+def test_a_pair_is_one_however_it_is_spelled(tmp_path: Path) -> None:
+    table = table_of(batch(3, [30, 20]))
+    expected = filtered(tmp_path, table, ".csv")
+    names = [(" 7", "7.0", "7")[k % 3] if k < 30 else (" a", "a ", "a")[k % 3] for k in range(50)]
+    for own in (names, [name.replace("a", "9") for name in names]):
+        result = filtered(tmp_path, table.with_columns(pl.Series("pair", own)), ".csv")
+        # text is compared as text, so 7 and 7.0 are one pair only where all names are numbers
+        if "9" in own[-1]:
+            assert result["score"].to_list() == expected["score"].to_list()
+        assert result["score"].to_list()[30:] == expected["score"].to_list()[30:]

@@ -153,7 +153,6 @@ def test_no_matches_give_empty_verdicts(tmp_path: Path) -> None:
         ({"keypoints0": np.zeros((6, 2), dtype=complex)}, "array 'keypoints0' must hold numbers, got complex128"),
         ({"keypoints0": np.zeros((6, 2), dtype=bool)}, "array 'keypoints0' must hold numbers, got bool"),
         ({"keypoints0": np.zeros((6, 2), dtype=object)}, "array 'keypoints0' holds Python objects"),
-        ({"extra": np.array([None])}, "array 'extra' holds Python objects"),
         ({"ptr": np.array([0, 5])}, "in.npz: ptr must rise from 0 to the number of rows 6"),
         ({"ptr": np.array([0.0, 6.0])}, "array 'ptr' must hold integers, got float64"),
         ({"group": np.zeros(5, dtype=int)}, "in.npz: group must have 6 rows as keypoints0 has, got 5"),

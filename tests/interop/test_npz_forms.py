@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 
 from tensor_stereo import Matches, filter_file
 from tensor_stereo.configs import FilterConfig
+from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.npz import filter_npz
 from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.match_batches import batch, expected_of_any_views
@@ -136,27 +138,48 @@ def test_kornias_dictionary_has_its_confidence_as_cost(tmp_path: Path) -> None:
     ("name", "values"),
     [
         ("match_indices", np.zeros((6, 2), dtype=int)),
+        ("match_indices", np.zeros((6, 2))),
         ("idxs", np.zeros((4, 2), dtype=int)),
-        ("matches_0", np.zeros(6, dtype=np.int16)),
+        ("pairs", np.zeros((4, 2), dtype=int)),
+        ("edges", np.zeros((2, 9), dtype=int)),
+        ("m01", np.zeros(6, dtype=np.int16)),
+        ("nn12", np.zeros((1, 6), dtype=np.uint16)),
+        ("gt_matches0", np.zeros(6, dtype=np.int16)),
+        ("Matches0", np.zeros(6)),
         ("match_mask", np.ones(6, dtype=bool)),
+        ("mask", np.ones(6, dtype=bool)),
         ("correspondences", np.zeros((6, 2), dtype=np.uint32)),
-        ("mkpts0", np.zeros((6, 2))),
+        ("mkpts0", np.zeros((4, 2))),
         ("partner_of_0", np.zeros(6, dtype=int)),
     ],
 )
 def test_an_array_that_may_pair_the_rows_is_refused_by_name(tmp_path: Path, name: str, values: np.ndarray) -> None:
     points = np.arange(12.0).reshape(6, 2)
+    arrays = {"keypoints0": points, "keypoints1": points, name: values}
     with pytest.raises(ValueError, match=f"in.npz pairs the rows of its keypoints, but the array '{name}' may say"):
-        filtered(tmp_path, {"keypoints0": points, "keypoints1": points, name: values})
+        filtered(tmp_path, arrays)
+    # unless something says that they are matches
+    np.testing.assert_array_equal(filtered(tmp_path, arrays | {"ptr": np.array([0, 6])})[name], values)
 
 
-@pytest.mark.parametrize("name", ["gt_matches0", "scale_index", "image_size"])
-def test_what_says_nothing_of_the_rows_is_carried_through(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("correct", np.ones(6, dtype=bool)),
+        ("frame", np.array(7)),
+        ("image_size0", np.array([640, 480])),
+        ("pair_idx", np.array([3])),
+        ("match_confidence", np.ones(6)),
+        ("descriptors0", np.zeros((6, 128), dtype=np.uint8)),
+        ("meta", np.array({"a": 1}, dtype=object)),
+    ],
+)
+def test_what_says_nothing_of_the_rows_is_carried_through(tmp_path: Path, name: str, values: np.ndarray) -> None:
     points = np.arange(12.0).reshape(6, 2)
-    values = np.array(3) if name == "scale_index" else np.zeros(6, dtype=int)
-    np.testing.assert_array_equal(
-        filtered(tmp_path, {"keypoints0": points, "keypoints1": points, name: values})[name], values
-    )
+    np.savez(tmp_path / "in.npz", keypoints0=points, keypoints1=points, **{name: values})
+    filter_npz(tmp_path / "in.npz", tmp_path / "out.npz", two_view_filter())
+    with zipfile.ZipFile(tmp_path / "in.npz") as before, zipfile.ZipFile(tmp_path / "out.npz") as after:
+        assert before.read(f"{name}.npy") == after.read(f"{name}.npy")
 
 
 def test_the_pair_of_a_row_is_not_given_twice(tmp_path: Path) -> None:
@@ -181,18 +204,24 @@ def own(seed: int, **more: np.ndarray) -> Arrays:
 
 
 def test_arrays_of_the_user_survive(tmp_path: Path) -> None:
-    users = {"score": np.linspace(-3, 8, 40), "inlier": np.arange(40)}
-    arrays = own(1, **users)
+    """Also a score that could be one of ours, through filters with and without a score."""
+    users = {"score": np.linspace(0.2, 0.9, 40), "filter_score": np.linspace(-1, 1, 40), "inlier": np.arange(40) > 7}
+    arrays = own(1, **users) | {"ptr": np.array([0, 40])}
     plain = filtered(tmp_path, own(1))
-    first = filtered(tmp_path, arrays)
-    second = filtered(tmp_path, first)
-    assert set(first) == {*arrays, "filter_score", "filter_inlier", "relation"} == set(second)
-    for result in (first, second):
-        for name, values in users.items():
-            np.testing.assert_array_equal(result[name], values)
-        np.testing.assert_array_equal(result["filter_score"], plain["score"])
-        np.testing.assert_array_equal(result["filter_inlier"], plain["inlier"])
-        np.testing.assert_array_equal(result["relation"], plain["relation"])
+    source, target = tmp_path / "in.npz", tmp_path / "out.npz"
+    np.savez(source, **arrays)
+    for score in ("consensus", "none", "consensus", "consensus"):
+        filter_npz(source, target, two_view_filter(score=score))
+        target.replace(source)
+        with np.load(source) as result:
+            scored = {"filter_score_2"} if score != "none" else set()
+            assert set(result) == {*arrays, "filter_inlier", "relation", *scored}
+            for name, values in users.items():
+                np.testing.assert_array_equal(result[name], values)
+            if scored:
+                np.testing.assert_array_equal(result["filter_score_2"], plain["score"])
+            np.testing.assert_array_equal(result["filter_inlier"], plain["inlier"])
+            np.testing.assert_array_equal(result["relation"], plain["relation"])
 
 
 def test_the_name_of_the_score_can_be_chosen_and_is_replaced_by_a_second_filter(tmp_path: Path) -> None:
@@ -210,8 +239,6 @@ def test_the_name_of_the_score_can_be_chosen_and_is_replaced_by_a_second_filter(
 
 
 def test_a_score_of_an_earlier_filter_does_not_outlive_its_verdicts(tmp_path: Path) -> None:
-    from tensor_stereo.interop.glue_factory import two_view_filter
-
     source, target = tmp_path / "in.npz", tmp_path / "out.npz"
     np.savez(source, **filtered(tmp_path, own(3)))
     filter_npz(source, target, two_view_filter(score="none"))

@@ -60,7 +60,7 @@ def index_matches(place: str, arrays: Mapping[str, Array], *, may_be_short: bool
     >>> matches.keypoints1.tolist(), indices.mask
     ([[0.0, 1.0]], array([ True]))
     """
-    points0, points1 = (_one_pair(place, name, arrays[name], 2) for name in ("keypoints0", "keypoints1"))
+    points0, points1 = (one_pair(place, name, arrays[name], 2) for name in ("keypoints0", "keypoints1"))
     is_batch = arrays["keypoints0"].ndim == 3
     found = {
         name: _read_indices(place, name, arrays[name], (len(points0), len(points1)), is_batch, may_be_short)
@@ -76,8 +76,15 @@ def index_matches(place: str, arrays: Mapping[str, Array], *, may_be_short: bool
     return pair_matches(place, points0, points1, indices.rows0, indices.rows1, cost), indices
 
 
-def _one_pair(place: str, name: str, array: Array, ndim: int) -> Array:
-    """An array without its batch axis of one."""
+def one_pair(place: str, name: str, array: Array, ndim: int) -> Array:
+    """An array without its batch axis of one.
+
+    Raises:
+        ValueError: if it has another number of axes, or not two coordinates where there are two.
+
+    >>> one_pair("m.npz", "keypoints0", np.zeros((1, 5, 2)), 2).shape
+    (5, 2)
+    """
     array = array[0] if array.ndim == ndim + 1 and len(array) == 1 else array
     if array.ndim != ndim or (ndim == 2 and array.shape[1] != 2):
         expected = "(N, 2), or (1, N, 2)" if ndim == 2 else "(N,), or (1, N)"
@@ -97,13 +104,13 @@ def _read_indices(
     of_both = not per_keypoint and not has_batch_axis and array.ndim >= 2
     values = _whole_numbers(place, name, array)
     if of_both:
-        rows = _one_pair(place, name, values, 2)
+        rows = one_pair(place, name, values, 2)
         for view, size in enumerate(num_keypoints):
             _check_rows(place, name, rows[:, view], size, f"keypoints{view}")
         mask: Bool = np.all(rows >= 0, axis=1)
         kept = rows[mask]
         return Indices(kept[:, 0], kept[:, 1], mask.reshape(array.shape[:-1]))
-    partner = _one_pair(place, name, values, 1)
+    partner = one_pair(place, name, values, 1)
     if len(partner) > sizes[0] or (len(partner) < sizes[0] and not may_be_short):
         view = int(name == "matches1")
         raise ValueError(f"{place}: {name} has {len(partner)} rows, but there are {sizes[0]} keypoints{view}")

@@ -83,8 +83,8 @@ def _pair_numbers(source: Path, table: pl.DataFrame) -> Int:
         raise ValueError(f"{_line(source, pair.is_null().arg_max() or 0)}: column 'pair' is empty")
     if not pair.dtype.is_integer():
         pair = pair.cast(pl.String).str.strip_chars()
-        numbers = _whole(pair.cast(pl.Float64, strict=False))
-        pair = pair if numbers.has_nulls() else numbers  # 1 and 1.0 are one pair
+        if pair.str.contains(r"^-?(0|[1-9]\d{0,14})(\.0*)?$").all():  # then 1 and 1.0 are one pair
+            pair = pair.cast(pl.Float64)
     ranks: Int = pair.rank("dense").to_numpy().astype(np.int64) - 1
     return ranks
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from tensor_stereo.interop.index_arrays import INDEX_ARRAYS, Indices, index_matches
+from tensor_stereo.interop.index_arrays import INDEX_ARRAYS, Indices, index_matches, one_pair
 from tensor_stereo.interop.result_names import earlier_results
 from tensor_stereo.interop.verdicts import Array, Int, Verdicts
 from tensor_stereo.ops.segments import check_range
@@ -175,7 +175,8 @@ def form_matches(place: str, form: Form, arrays: Mapping[str, Array]) -> ReadPai
         matches, indices = index_matches(place, arrays)
         return ReadPairs(matches, indices=indices)
     shape = arrays[form.points0].shape
-    flat = {name: _rows(place, name, array, form) for name, array in arrays.items()}
+    views = (form.points0, form.points1)
+    flat = {name: one_pair(place, name, array, 2 if name in views else 1) for name, array in arrays.items()}
     num_matches = len(flat[form.points0])
     for name, values in flat.items():
         if name != "ptr" and len(values) != num_matches:
@@ -206,17 +207,6 @@ def form_matches(place: str, form: Form, arrays: Mapping[str, Array]) -> ReadPai
         name = next(name for name in ("cost", *_CONFIDENCE) if name in flat)
         raise ValueError(f"{describe(name, int(matches.cost.isnan().int().argmax()))} must not be NaN")
     return ReadPairs(matches, order, shape[:-1])
-
-
-def _rows(place: str, name: str, array: Array, form: Form) -> Array:
-    """An array with one entry per row, without a batch axis of one."""
-    ndim = 2 if name in (form.points0, form.points1) else 1
-    rows = array[0] if array.ndim == ndim + 1 and len(array) == 1 else array
-    if rows.ndim != ndim or (ndim == 2 and rows.shape[1] != 2):
-        raise ValueError(
-            f"{place}, array {name!r} must have shape {'(N, 2)' if ndim == 2 else '(N,)'}, got {array.shape}"
-        )
-    return rows
 
 
 def _pairs(flat: Mapping[str, Array], num_matches: int) -> tuple[Int, Int | None]:

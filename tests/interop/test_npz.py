@@ -148,7 +148,7 @@ def test_no_matches_give_empty_verdicts(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"keypoints1": None}, "must hold the array 'keypoints1', it has"),
-        ({"keypoints0": np.zeros((3, 3))}, r"array 'keypoints0' must have shape \(N, 2\), got \(3, 3\)"),
+        ({"keypoints0": np.zeros((3, 3))}, r"array 'keypoints0' must have shape \(N, 2\).*, got \(3, 3\)"),
         ({"keypoints0": np.zeros((3, 2))}, "in.npz: keypoints1 must have 3 rows as keypoints0 has, got 6"),
         ({"keypoints0": np.zeros((6, 2), dtype=complex)}, "array 'keypoints0' must hold numbers, got complex128"),
         ({"keypoints0": np.zeros((6, 2), dtype=bool)}, "array 'keypoints0' must hold numbers, got bool"),

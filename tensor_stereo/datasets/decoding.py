@@ -16,7 +16,7 @@ from tensor_stereo.datasets.netpbm import MAX_MAXVAL, decode_netpbm, is_netpbm
 from tensor_stereo.datasets.structure import PNG_SIGNATURE, damaged_format, significant_bits
 from tensor_stereo.datasets.tiff import STARTS, has_white_zero, sample_range, without_orientation
 
-MAX_PIXELS = 1 << 26  # 8192 x 8192
+MAX_PIXELS = 1 << 27  # 11585 x 11585
 
 
 class Stored(NamedTuple):

@@ -10,14 +10,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-# What libjpeg and libpng print where samples are missing or wrong; their other messages are about padding and
-# metadata. Source: jerror.h of libjpeg (the warnings JWRN_HIT_MARKER, JWRN_HUFF_BAD_CODE, JWRN_JPEG_EOF,
-# JWRN_MUST_RESYNC), png.h of libpng.
+# What libjpeg and libpng print where samples are missing or wrong, and what they print about padding and metadata.
+# Source: jerror.h of libjpeg-turbo (its warnings, JWRN_*), png.h of libpng.
 _DAMAGE = re.compile(
-    r"libpng error.*|.*premature end .*|.*bad Huffman code.*|.*instead of RST.*|.*[Cc]orrupt JPEG data: found.*"
+    r"libpng error.*|.*premature end .*|.*bad (Huffman|arithmetic) code.*|.*instead of RST.*|"
+    r".*[Cc]orrupt JPEG data: found.*|Inconsistent progression sequence.*"
 )
 _OF_DECODERS = re.compile(
     r"libpng (warning|error): .*|Corrupt JPEG data: .*|Premature end of JPEG .*|Invalid SOS parameters .*|"
+    r"Unknown Adobe color transform .*|Inconsistent progression .*|Application transferred too many scanlines|"
     r"Warning: unknown JFIF revision .*|Unsupported marker type .*|\[ *(WARN|ERROR|INFO):\d+@.*"
 )
 _LOCK = threading.Lock()
@@ -66,6 +67,6 @@ def caught_messages() -> Iterator[DecoderMessages]:
         said = file.read().decode(errors="replace").splitlines()
     found = (_DAMAGE.fullmatch(line.strip()) for line in said)
     messages.damage = next((match[0] for match in found if match), "")
-    others = [line for line in said if not _OF_DECODERS.fullmatch(line.strip())]
+    others = [line for line in said if line.strip() and not _OF_DECODERS.fullmatch(line.strip())]
     if others:
         os.write(2, "".join(f"{line}\n" for line in others).encode())

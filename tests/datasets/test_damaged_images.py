@@ -43,7 +43,7 @@ def test_other_messages_of_the_process_are_not_lost(tmp_path, capfd):
     from tensor_stereo.datasets.decoder_messages import caught_messages
 
     with caught_messages() as messages:
-        os.write(2, b"libpng warning: iCCP: known incorrect sRGB profile\nsomebody else\n")
+        os.write(2, b"libpng warning: iCCP: known incorrect sRGB profile\n\nsomebody else\n")
     assert messages.damage == ""
     assert capfd.readouterr().err == "somebody else\n"
 
@@ -72,3 +72,9 @@ def test_a_float_map_with_signalling_nan_is_unknown_there(tmp_path, recwarn):
     assert found.isnan().tolist() == [[True, True, False, True]]
     assert found[0, 2] == 10
     assert not recwarn.list
+
+
+def test_a_damaged_bitmap_of_netpbm_prints_nothing(tmp_path, capfd):
+    with pytest.raises(ValueError, match=r"im0\.pgm cannot be decoded as an image"):
+        read_image(write(tmp_path / "im0.pgm", b"P1 made for tests\n96 72\n255\n24 24 0x10 24"))
+    assert capfd.readouterr() == ("", "")

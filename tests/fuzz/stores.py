@@ -211,6 +211,7 @@ def _change_dataset(dataset: Any, rng: Random) -> None:
             {"fillvalue": 7}, {"chunks": tuple(1 << 20 for _ in shape), "maxshape": (None,) * len(shape)},
         ))  # fmt: skip
     values = np.resize(np.arange(-1, 39), shape).astype(form) if form.kind in "fiu" and rng.random() < 0.7 else None
+    values = None if "external" in settings else values  # they would be written to another file
     if values is None and rng.random() < 0.3 and shape:
         shape = (rng.choice((1 << 20, 1 << 26, 1 << 27, 1 << 40)), *shape[1:])
         settings.setdefault("chunks", (1024, *shape[1:]))

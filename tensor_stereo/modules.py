@@ -16,7 +16,8 @@ from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FileFilterConfig, FilterConfig
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores.by_name import score_matches
+from tensor_stereo.scores.alignment import Alignment, estimate_alignment
+from tensor_stereo.scores.by_name import is_aligned, score_matches
 from tensor_stereo.scores.image_evidence import ImageEvidence
 from tensor_stereo.scores.learned import LearnedScore, load_learned
 from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
@@ -39,6 +40,8 @@ class FilterOutput:
         relation: int8 values of :class:`Relation`, UNTESTED in the padding.
         matches: the M real matches of the input, as one ragged batch.
         mask: bool, the places of ``matches`` in the layout; None for ragged input.
+        alignment: Row offset and row drift of each of the B rectified pairs, which the score has taken out, and whether
+            enough matches agree on them; None where the score takes none out.
     """
 
     inlier: Tensor
@@ -46,6 +49,7 @@ class FilterOutput:
     relation: Tensor
     matches: Matches
     mask: Tensor | None = None
+    alignment: Alignment | None = None
 
     def to_matches(self) -> Matches:
         """The inliers, for the next filter. All pairs stay, some possibly empty; gradients flow to the keypoints."""
@@ -261,7 +265,7 @@ class DelaunayFilter(nn.Module):
         )
         if single:
             inlier, score, relation, mask = (None if v is None else v[0] for v in (inlier, score, relation, mask))
-        return FilterOutput(inlier, score, relation, matches, mask)  # type: ignore[arg-type]
+        return FilterOutput(inlier, score, relation, matches, mask, output.alignment)  # type: ignore[arg-type]
 
     def _decide(
         self, matches: Matches, images0: Images | None, images1: Images | None, evidence: ImageEvidence | None
@@ -273,11 +277,23 @@ class DelaunayFilter(nn.Module):
             for name, value in (("images0", images), ("evidence", evidence)):
                 if value is not None:
                     raise TypeError(f"{name} must be None where there is no score")
+        graphs = alignment = None
+        if config.resolved_score != "topology":
             graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
+        if graphs is not None and config.resolved_score == "none":
             verdict = classify_graphs(graphs, config)
             return FilterOutput(verdict.inlier, None, verdict.relation, matches)
+        if graphs is not None and is_aligned(config):
+            alignment = estimate_alignment(matches, graphs)
         score, graphs = score_matches(
-            matches, config, images=images, evidence=evidence, temperature=self.temperature, network=self.network
+            matches,
+            config,
+            graphs,
+            images=images,
+            evidence=evidence,
+            alignment=alignment,
+            temperature=self.temperature,
+            network=self.network,
         )
         score = score.to(matches.keypoints0.dtype)
         verdict, score = apply_score(classify_graphs(graphs, config), score, matches.ptr, config)
@@ -286,7 +302,7 @@ class DelaunayFilter(nn.Module):
             score = score.to(torch.get_autocast_dtype(device))
         if self.straight_through:
             score = score + (verdict.inlier.to(score.dtype) - score).detach()
-        return FilterOutput(verdict.inlier, score, verdict.relation, matches)
+        return FilterOutput(verdict.inlier, score, verdict.relation, matches, alignment=alignment)
 
 
 def _refuse_other_score(module: DelaunayFilter, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:

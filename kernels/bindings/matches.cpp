@@ -32,14 +32,16 @@ auto relate(Integers overlap, Integers degree0, Integers degree1, Integers group
     return std::tuple(give(std::move(relation), count), give(std::move(inlier), count));
 }
 
-auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::optional<Doubles> cost, Integers crow0,
-                      Integers cols0, Integers crow1, Integers cols1, double tolerance, double whole_tolerance,
-                      std::optional<double> row_tolerance, double whole_row_tolerance, double slope, double reach,
-                      double doubt, double cost_weight, int num_rounds, int num_threads) {
+auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::optional<Doubles> cost,
+                      std::optional<Doubles> row_shift, Integers crow0, Integers cols0, Integers crow1, Integers cols1,
+                      double tolerance, double whole_tolerance, std::optional<double> row_tolerance,
+                      double whole_row_tolerance, double slope, double reach, double doubt, double cost_weight,
+                      int num_rounds, int num_threads) {
     const std::size_t num_matches = keypoints0.shape(0);
     const auto num_rows = static_cast<std::int64_t>(num_matches);
     check(keypoints1.shape(0) == num_matches, "keypoints0 and keypoints1 must have the same length");
     check(!cost || cost->shape(0) == num_matches, "cost must have one entry per match");
+    check(!row_shift || row_shift->shape(0) == num_matches, "row_shift must have one entry per match");
     check_offsets(ptr, num_rows, "ptr must rise from 0 to the number of matches");
     check(crow0.shape(0) == num_matches + 1 && crow1.shape(0) == num_matches + 1, "crow must have one row per match");
     check_offsets(crow0, static_cast<std::int64_t>(cols0.shape(0)), "crow0 must rise from 0 to the length of cols0");
@@ -54,6 +56,7 @@ auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::o
                               ptr.data(),
                               static_cast<std::int64_t>(ptr.shape(0)) - 1,
                               cost ? cost->data() : nullptr,
+                              row_shift ? row_shift->data() : nullptr,
                               {crow0.data(), crow1.data()},
                               {cols0.data(), cols1.data()}},
                              {tolerance, whole_tolerance, row_tolerance, whole_row_tolerance, slope, reach, doubt,
@@ -105,10 +108,10 @@ void bind_matches(nb::module_& module) {
     module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),
                nb::arg("min_group_size"), nb::arg("accept_subsets"));
     module.def("consensus_belief", &consensus_belief, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("ptr"),
-               nb::arg("cost").none(), nb::arg("crow0"), nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"),
-               nb::arg("tolerance"), nb::arg("whole_tolerance"), nb::arg("row_tolerance").none(),
-               nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"), nb::arg("doubt"),
-               nb::arg("cost_weight"), nb::arg("num_rounds"), nb::arg("num_threads"));
+               nb::arg("cost").none(), nb::arg("row_shift").none(), nb::arg("crow0"), nb::arg("cols0"),
+               nb::arg("crow1"), nb::arg("cols1"), nb::arg("tolerance"), nb::arg("whole_tolerance"),
+               nb::arg("row_tolerance").none(), nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"),
+               nb::arg("doubt"), nb::arg("cost_weight"), nb::arg("num_rounds"), nb::arg("num_threads"));
     module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),
                nb::arg("cost").none(), nb::arg("num_threads"));
     module.def("gated_ssd", &gated_ssd, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("descriptors0"),

@@ -66,23 +66,30 @@ struct Moments {
     }
 };
 
-// The length of the mean of exp(2 pi i x) over the x and y of both views: 1 for whole pixels, 0 anywhere.
-double whole_pixels(const ConsensusMatches& matches, std::int64_t begin, std::int64_t end) noexcept {
-    double share = 1;
-    for (const double* const keypoints : matches.keypoints) {
-        for (int axis = 0; axis < 2; ++axis) {
-            double real = 0, imaginary = 0;
-            for (std::int64_t row = begin; row < end; ++row) {
-                const double value = keypoints[2 * row + axis];
-                const double phase = 2 * std::numbers::pi * (value - std::nearbyint(value));
-                real += std::cos(phase);
-                imaginary += std::sin(phase);
-            }
-            const auto count = static_cast<double>(end - begin);
-            share *= std::hypot(real / count, imaginary / count);
-        }
+// The length of the mean of exp(2 pi i x) over the rows of a pair: 1 for whole pixels, 0 anywhere.
+template <class Value>
+double grid_share(const Value& value, std::int64_t begin, std::int64_t end) noexcept {
+    double real = 0, imaginary = 0;
+    for (std::int64_t row = begin; row < end; ++row) {
+        const double x = value(row), phase = 2 * std::numbers::pi * (x - std::nearbyint(x));
+        real += std::cos(phase);
+        imaginary += std::sin(phase);
     }
-    return share;
+    const auto count = static_cast<double>(end - begin);
+    return std::hypot(real / count, imaginary / count);
+}
+
+// The product over the x and y of both views; rows of view 1 as they are or without the shift, if that is more.
+double whole_pixels(const ConsensusMatches& matches, std::int64_t begin, std::int64_t end) noexcept {
+    const auto share = [&](int view, int axis) {
+        return grid_share([&](std::int64_t row) { return matches.keypoints[view][2 * row + axis]; }, begin, end);
+    };
+    double last = share(1, 1);
+    if (matches.row_shift != nullptr) {
+        const auto moved = [&](std::int64_t row) { return matches.keypoints[1][2 * row + 1] - matches.row_shift[row]; };
+        last = std::max(last, grid_share(moved, begin, end));
+    }
+    return share(0, 0) * share(0, 1) * share(1, 0) * last;
 }
 
 class Consensus {
@@ -170,7 +177,9 @@ class Consensus {
         const double narrow = *settings_.row_tolerance;
         const double tolerance = narrow + (settings_.whole_row_tolerance - narrow) * whole;
         for (std::int64_t row = begin; row < end; ++row) {
-            const double offset = (matches_.keypoints[0][2 * row + 1] - matches_.keypoints[1][2 * row + 1]) / tolerance;
+            double offset = matches_.keypoints[0][2 * row + 1] - matches_.keypoints[1][2 * row + 1];
+            if (matches_.row_shift != nullptr) offset += matches_.row_shift[row];
+            offset /= tolerance;
             odds_[row] -= std::log1p(offset * offset);
         }
     }

@@ -18,7 +18,7 @@ constexpr ts::ConsensusSettings kSettings{0.6, 1.0, 0.25, 1.5, 0.2, 2.0, 1.0, 0.
 
 // Matches of a sloped surface with some noise, of which every `wrong`-th is displaced; 0: none.
 struct ConsensusSample {
-    std::vector<double> keypoints[2], cost;
+    std::vector<double> keypoints[2], cost, row_shift;
     std::vector<std::int64_t> ptr{0};
 
     void add_pair(std::mt19937_64& rng, int count, int wrong) {
@@ -47,6 +47,7 @@ struct ConsensusSample {
                 ptr.data(),
                 num_pairs,
                 cost.data(),
+                row_shift.empty() ? nullptr : row_shift.data(),
                 {graph0.crow.get(), graph1.crow.get()},
                 {graph0.cols.get(), graph1.cols.get()}},
                settings, num_threads, result.data());

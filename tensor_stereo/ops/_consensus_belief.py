@@ -12,7 +12,7 @@ from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 
 _DIFFERENTIABLE = (0, 1, 3)  # positions of keypoints0, keypoints1 and cost
-_NUM_TENSORS, _NUM_ARGUMENTS = 8, 18
+_NUM_TENSORS, _NUM_ARGUMENTS = 9, 19
 
 
 def _fake(keypoints0: Tensor, *_: object) -> Tensor:
@@ -50,6 +50,7 @@ def consensus_belief(
     keypoints1: Tensor,
     ptr: Tensor,
     cost: Tensor | None,
+    row_shift: Tensor | None,
     crow0: Tensor,
     cols0: Tensor,
     crow1: Tensor,
@@ -75,6 +76,8 @@ def consensus_belief(
         ptr: (B + 1,) int64 offsets of the pairs.
         cost: (M,) floating point, or None. In a pair with negative costs, costs count from the lowest one. In a pair
             with a cost beyond 1e300, costs are no evidence.
+        row_shift: (M,) float64 px, how much lower the row of each match in view 1 is expected than in view 0; None: not
+            at all. A constant.
         crow0: (M + 1,) int64 row offsets of the graph of view 0.
         cols0: (nnz0,) int64 neighbours, of the same pair and distinct from the match in view 0.
         crow1: (M + 1,) int64 row offsets of the graph of view 1.
@@ -96,8 +99,8 @@ def consensus_belief(
 
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])
-        >>> graphs = (crow, torch.tensor([1, 0])) * 2
-        >>> consensus_belief(points, points, ptr, None, *graphs, 0.6, 1.0, None, 1.0, 0.2, 2.0, 1.0, 0.5, 1, "auto")
+        >>> graphs, settings = (crow, torch.tensor([1, 0])) * 2, (0.6, 1.0, None, 1.0, 0.2, 2.0, 1.0, 0.5, 1)
+        >>> consensus_belief(points, points, ptr, None, None, *graphs, *settings, "auto")
         tensor([0.4444, 0.4444], dtype=torch.float64)
     """
     tolerances = tolerance_px, whole_tolerance_px, row_tolerance_px, whole_row_tolerance_px
@@ -105,11 +108,11 @@ def consensus_belief(
     graphs = crow0, cols0, crow1, cols1
     kernels = native(backend)
     if kernels is None:
-        return reference_consensus.consensus_belief(keypoints0, keypoints1, ptr, cost, *graphs, *settings)
+        return reference_consensus.consensus_belief(keypoints0, keypoints1, ptr, cost, row_shift, *graphs, *settings)
     result = kernels.consensus_belief(
         *(_to_float64(keypoints) for keypoints in (keypoints0, keypoints1)),
         ptr.contiguous().numpy(force=True),
-        None if cost is None else _to_float64(cost),
+        *(None if values is None else _to_float64(values) for values in (cost, row_shift)),
         *(tensor.contiguous().numpy(force=True) for tensor in graphs),
         *settings,
         torch.get_num_threads(),

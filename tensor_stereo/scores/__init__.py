@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 from tensor_stereo.lazy import attach
 
 if TYPE_CHECKING:
+    from tensor_stereo.scores.alignment import Alignment as Alignment
+    from tensor_stereo.scores.alignment import align_matches as align_matches
+    from tensor_stereo.scores.alignment import estimate_alignment as estimate_alignment
     from tensor_stereo.scores.by_name import score_matches as score_matches
     from tensor_stereo.scores.calibration import calibrate_consensus as calibrate_consensus
     from tensor_stereo.scores.calibration import keep_by_target as keep_by_target
@@ -22,12 +25,15 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "Alignment": "alignment",
         "DomainWarning": "domain",
         "ImageEvidence": "image_evidence",
         "LearnedScore": "learned",
+        "align_matches": "alignment",
         "calibrate_consensus": "calibration",
         "consensus_belief": "consensus",
         "consensus_score": "consensus",
+        "estimate_alignment": "alignment",
         "keep_by_target": "calibration",
         "load_learned": "learned",
         "measure_images": "image_evidence",

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
+from tensor_stereo.scores.alignment import Alignment, estimate_alignment
 from tensor_stereo.scores.consensus import consensus_score
 from tensor_stereo.scores.domain import check_domain, check_images
 from tensor_stereo.scores.image_evidence import ImageEvidence, measure_images
@@ -23,6 +24,7 @@ def score_matches(
     *,
     images: tuple[Sequence[Tensor], Sequence[Tensor]] | None = None,
     evidence: ImageEvidence | None = None,
+    alignment: Alignment | None = None,
     temperature: Tensor | None = None,
     network: LearnedScore | None = None,
 ) -> tuple[Tensor, MatchGraphs]:
@@ -36,6 +38,8 @@ def score_matches(
         images: The B images of view 0 and those of view 1, at which ``learned`` looks, as
             :func:`tensor_stereo.scores.image_evidence.measure_images` takes them.
         evidence: What the images say, if that was measured before; instead of ``images``.
+        alignment: Where the rows of view 0 lie in view 1, which ``consensus`` and ``learned`` take out; None: it is
+            estimated for rectified pairs.
         temperature: () of ``topology``, in place of that of the settings, for gradients.
         network: The network of ``learned``; None means the one with the weights of this package.
 
@@ -73,10 +77,22 @@ def score_matches(
         return soft_jaccard(counts), found.graphs
     if graphs is None:
         graphs = build_match_graphs(matches, **options)  # type: ignore[arg-type]
-    check_domain(matches, graphs, config)
+    if alignment is None and is_aligned(config):
+        alignment = estimate_alignment(matches, graphs)
+    check_domain(matches, graphs, config, alignment)
     if name == "consensus":
-        return consensus_score(matches, graphs, config), graphs
+        return consensus_score(matches, graphs, config, alignment), graphs
     if images is not None:
         check_images(matches, images)
-        evidence = measure_images(*images, matches, graphs)
-    return score_learned(matches, graphs, evidence, config, network=network), graphs
+        evidence = measure_images(*images, matches, graphs, alignment)
+    return score_learned(matches, graphs, evidence, config, alignment=alignment, network=network), graphs
+
+
+def is_aligned(config: FilterConfig) -> bool:
+    """Whether the score takes the alignment of rectified pairs out.
+
+    >>> is_aligned(FilterConfig()), is_aligned(FilterConfig(verdict="cardinality"))
+    (True, False)
+    """
+    name = config.resolved_score
+    return name == "learned" or (name == "consensus" and config.consensus.rectified)

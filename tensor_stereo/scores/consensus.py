@@ -15,11 +15,14 @@ from tensor_stereo import ops
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.ops.registration import refuse_tangent
+from tensor_stereo.scores.alignment import Alignment
 from tensor_stereo.scores.calibration import calibrate_consensus
 from tensor_stereo.types import Matches
 
 
-def consensus_score(matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None) -> Tensor:
+def consensus_score(
+    matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None, alignment: Alignment | None = None
+) -> Tensor:
     """The calibrated probability that each match is right, by what its neighbours in both views believe.
 
     It is :func:`consensus_belief` through :func:`tensor_stereo.scores.calibration.calibrate_consensus`.
@@ -28,6 +31,7 @@ def consensus_score(matches: Matches, graphs: MatchGraphs, config: FilterConfig 
         matches: B pairs, as for :func:`consensus_belief`.
         graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
         config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
     Returns:
         (M,) probability that the disparity is right within 1 px, in the dtype of the keypoints. Gradients flow to both
@@ -48,11 +52,13 @@ def consensus_score(matches: Matches, graphs: MatchGraphs, config: FilterConfig 
         (tensor(True), tensor(True))
     """
     config = config or FilterConfig()
-    belief = _believe(matches, graphs, config)
+    belief = _believe(matches, graphs, config, alignment)
     return calibrate_consensus(belief, rectified=config.consensus.rectified).to(matches.keypoints0.dtype)
 
 
-def consensus_belief(matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None) -> Tensor:
+def consensus_belief(
+    matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None, alignment: Alignment | None = None
+) -> Tensor:
     """How much the neighbours of each match believe in it, before calibration.
 
     Args:
@@ -61,11 +67,12 @@ def consensus_belief(matches: Matches, graphs: MatchGraphs, config: FilterConfig
         graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
         config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs. Back
             ends may differ in the last digits.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
     Returns:
         (M,) in [0, 1], higher is more likely correct; 0 without neighbours; in the dtype of the keypoints. Gradients
-        flow to both keypoints and the cost, and are finite; the graphs and the choice of the tolerance are constant.
-        There is no forward mode.
+        flow to both keypoints and the cost, and are finite; graphs, alignment and the choice of the tolerance are
+        constant. There is no forward mode.
 
     Raises:
         ValueError: for graphs over another number of matches.
@@ -82,10 +89,10 @@ def consensus_belief(matches: Matches, graphs: MatchGraphs, config: FilterConfig
         >>> belief[0] < 0.01, belief[1:].min() > 0.5
         (tensor(True), tensor(True))
     """
-    return _believe(matches, graphs, config or FilterConfig()).to(matches.keypoints0.dtype)
+    return _believe(matches, graphs, config or FilterConfig(), alignment).to(matches.keypoints0.dtype)
 
 
-def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig) -> Tensor:
+def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignment: Alignment | None) -> Tensor:
     """(M,) float64."""
     for name in ("keypoints0", "keypoints1", "cost"):
         values: Tensor | None = getattr(matches, name)
@@ -93,11 +100,15 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig) -> Ten
             refuse_tangent(name, values, "consensus")
     check_match_graphs(matches, graphs)
     settings = config.consensus
+    row_shift = None
+    if settings.rectified and alignment is not None:
+        row_shift = alignment.row_shift(matches.keypoints0, matches.ptr)
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
         matches.keypoints1,
         matches.ptr,
         matches.cost,
+        row_shift,
         graphs.adjacency0.crow_indices,
         graphs.adjacency0.col_indices,
         graphs.adjacency1.crow_indices,

@@ -12,6 +12,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.relations import shared_neighbors
+from tensor_stereo.scores.alignment import Alignment, align_matches
 from tensor_stereo.types import Matches
 
 MAX_PX = 2.0**24  # beyond it float32 does not tell neighbouring pixels apart
@@ -27,12 +28,15 @@ class DomainWarning(UserWarning):
     """A score was asked for outside of what it was calibrated on."""
 
 
-def check_domain(matches: Matches, graphs: MatchGraphs, config: FilterConfig) -> None:
+def check_domain(
+    matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignment: Alignment | None = None
+) -> None:
     """Raise or warn where keypoints are no pixels of rectified pairs; one warning of a kind for the whole batch.
 
     Args:
         matches: B pairs.
         graphs: The graphs of the same matches.
+        alignment: What the score takes out of the rows of rectified pairs; None: nothing.
         config: Its score is ``consensus`` or ``learned``; ``consensus`` can be set for pairs that are not rectified.
 
     Raises:
@@ -50,7 +54,8 @@ def check_domain(matches: Matches, graphs: MatchGraphs, config: FilterConfig) ->
             _check_magnitude(name, getattr(matches, name), matches.ptr, batch)
         small = (_spans(matches, batch) < _LEAST_SPAN_PX).nonzero()[:, 0].tolist()
         is_rectified = config.resolved_score == "learned" or config.consensus.rectified
-        off = _pairs_off_their_rows(matches, graphs, batch, config) if is_rectified else []
+        aligned = matches if alignment is None else align_matches(matches, alignment)
+        off = _pairs_off_their_rows(aligned, graphs, batch, config) if is_rectified else []
     if small:
         message = (
             f"the score expects keypoints in pixels, but those of {_count(small, matches)} span less than "

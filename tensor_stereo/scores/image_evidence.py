@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tensor_stereo.features import list_images, to_gray
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
+from tensor_stereo.scores.alignment import Alignment, align_matches
 from tensor_stereo.types import Matches
 
 MAX_DISPARITIES = 256  # of one pair's search range
@@ -60,7 +61,11 @@ class ImageEvidence(NamedTuple):
 
 @torch.no_grad()
 def measure_images(
-    images0: Tensor | Sequence[Tensor], images1: Tensor | Sequence[Tensor], matches: Matches, graphs: MatchGraphs
+    images0: Tensor | Sequence[Tensor],
+    images1: Tensor | Sequence[Tensor],
+    matches: Matches,
+    graphs: MatchGraphs,
+    alignment: Alignment | None = None,
 ) -> ImageEvidence:
     """Hold the windows of every match against each other and against the rows that they lie in.
 
@@ -70,6 +75,7 @@ def measure_images(
         images1: their partners.
         matches: B pairs, keypoints in px of these images; outside of them the border is repeated.
         graphs: of the same matches; they tell which disparities to search.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
     Returns:
         One row per match, on the device of the keypoints; it does not depend on the other pairs. No gradient.
@@ -89,7 +95,10 @@ def measure_images(
         list_images(name, images, matches.num_pairs) for name, images in (("images0", images0), ("images1", images1))
     ]
     check_match_graphs(matches, graphs)
-    ranges = search_ranges(matches, graphs)
+    ranges = search_ranges(matches if alignment is None else align_matches(matches, alignment), graphs)
+    row_shift = matches.keypoints0.new_zeros(matches.num_matches).float()
+    if alignment is not None:
+        row_shift = alignment.row_shift(matches.keypoints0, matches.ptr).float()
     width = max((count for _, count in ranges), default=0)
     parts = [_empty(matches.keypoints0, width)]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
@@ -98,7 +107,7 @@ def measure_images(
             for row in range(start, stop, _ROWS_AT_ONCE):
                 rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
                 points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
-                parts.append(_measure_both(gray, points, *ranges[b], width))
+                parts.append(_measure_both(gray, points, row_shift[rows], *ranges[b], width))
     values, curve0, curve1 = (torch.cat(part) for part in zip(*parts, strict=True))
     spread = torch.tensor(ranges, dtype=torch.int64, device=matches.ptr.device).reshape(-1, 2)
     first, count = spread.repeat_interleave(matches.ptr.diff(), 0).unbind(1)
@@ -151,14 +160,17 @@ def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
 
 
 def _measure_both(
-    gray: Sequence[Tensor], points: Sequence[Tensor], first: int, count: int, width: int
+    gray: Sequence[Tensor], points: Sequence[Tensor], row_shift: Tensor, first: int, count: int, width: int
 ) -> tuple[Tensor, ...]:
     """Values and both curves of m matches of one pair."""
     own = (points[0][:, 0] - points[1][:, 0] - first).round()  # column of the match
     columns, curves, levels = [], [], []
     for view in (0, 1):
         windows = _sample(gray[view], points[view], _RADIUS_PX)
-        side, curve = _measure_one(gray[1 - view], windows, points[view], points[1 - view], own, first, count, view)
+        row = points[view][:, 1] + (-row_shift if view else row_shift)  # in the other view
+        side, curve = _measure_one(
+            gray[1 - view], windows, points[view], row, points[1 - view], own, first, count, view
+        )
         columns += side
         curves.append(torch.nn.functional.pad(curve, (0, width - count)))
         levels.append(windows[:, 4:-4, 4:-4].mean((1, 2)))
@@ -168,7 +180,15 @@ def _measure_both(
 
 
 def _measure_one(
-    other: Tensor, windows: Tensor, points: Tensor, partners: Tensor, own: Tensor, first: int, count: int, view: int
+    other: Tensor,
+    windows: Tensor,
+    points: Tensor,
+    row: Tensor,
+    partners: Tensor,
+    own: Tensor,
+    first: int,
+    count: int,
+    view: int,
 ) -> tuple[list[Tensor], Tensor]:
     """Values of the windows of one view, held against the image of the other, and their curve."""
     kernels = _window_kernels(windows)
@@ -177,11 +197,11 @@ def _measure_one(
     if not view:  # disparity grows against the columns of view 1
         cost, likeness = cost.flip(1), likeness.flip(1)
     mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
-    # the row of the window itself: there lies a rectified partner
+    # the row of the window itself, but for the alignment: there lies a rectified partner
     toward = 1 if view else -1  # way of growing disparity in the other view
     x = points[:, :1] + toward * (first + torch.arange(count, device=points.device))  # (m, D)
     left = x.amin(1) if count else points[:, 0]
-    strip = _sample_strip(other, left - _RADIUS_PX, points[:, 1], count + 2 * _RADIUS_PX)
+    strip = _sample_strip(other, left - _RADIUS_PX, row, count + 2 * _RADIUS_PX)
     far, far_likeness, _ = _compare(windows, strip, kernels[..., :_WHOLE])
     if not view:
         far, far_likeness = far.flip(1), far_likeness.flip(1)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
+from tensor_stereo.scores.alignment import Alignment
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.scores.learned_inputs import (
     NUM_COST,
@@ -79,6 +80,7 @@ class LearnedScore(nn.Module):
         graphs: MatchGraphs,
         evidence: ImageEvidence | None = None,
         config: FilterConfig | None = None,
+        alignment: Alignment | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Logit, as trained, and calibrated probability of each match being correct.
 
@@ -87,12 +89,13 @@ class LearnedScore(nn.Module):
             graphs: of the same matches.
             evidence: of their images, or None.
             config: ``backend`` is read; None means the defaults.
+            alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
         Returns:
             (M,) float32 each. Gradients flow to the keypoints from all that is continuous in them, and are finite.
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
-            logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config))
+            logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config, alignment))
             return logit, self.calibrate(logit)
 
     def infer(self, q: Quantities) -> tuple[Tensor, list[Tensor]]:
@@ -218,6 +221,7 @@ def score_learned(
     evidence: ImageEvidence | None = None,
     config: FilterConfig | None = None,
     *,
+    alignment: Alignment | None = None,
     network: LearnedScore | None = None,
 ) -> Tensor:
     """Calibrated probability of every match being correct.
@@ -227,6 +231,7 @@ def score_learned(
         graphs: of the same matches.
         evidence: of their images, or None.
         config: ``backend`` is read; None means the defaults.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
         network: The network that scores; None means the one with the weights of this package.
 
     Returns:
@@ -249,9 +254,12 @@ def score_learned(
     check_fit(matches, graphs, evidence)
     network = load_learned(matches.keypoints0.device) if network is None else network
     if torch.compiler.is_compiling():  # the lengths of the pairs are not known yet
-        _, probability = network(matches, graphs, evidence, config)
+        _, probability = network(matches, graphs, evidence, config, alignment)
         return probability  # type: ignore[no-any-return]
-    parts = [network(*part, config)[1] for part in _parts(matches, graphs, evidence)]
+    parts = [
+        network(part, own, seen, config, None if alignment is None else alignment.select(*pairs))[1]
+        for pairs, part, own, seen in _parts(matches, graphs, evidence)
+    ]
     if not parts:
         return (matches.keypoints0 + matches.keypoints1).float()[:, 0]  # empty, with a gradient like any other
     return torch.cat(parts)
@@ -259,7 +267,7 @@ def score_learned(
 
 def _parts(
     matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None
-) -> Iterator[tuple[Matches, MatchGraphs, ImageEvidence | None]]:
+) -> Iterator[tuple[tuple[int, int], Matches, MatchGraphs, ImageEvidence | None]]:
     """Runs of pairs whose matches number about :data:`_MATCHES_AT_ONCE`."""
     offsets = matches.ptr.tolist()
     first = 0
@@ -273,7 +281,7 @@ def _parts(
         part = Matches(matches.keypoints0[rows], matches.keypoints1[rows], ptr, cost=cost)
         adjacency0, adjacency1 = (_cut(whole, rows, ptr) for whole in (graphs.adjacency0, graphs.adjacency1))
         seen = None if evidence is None else ImageEvidence(*(values[rows] for values in evidence))
-        yield part, MatchGraphs(adjacency0, adjacency1, graphs.group_size[rows]), seen
+        yield (first, last), part, MatchGraphs(adjacency0, adjacency1, graphs.group_size[rows]), seen
         first = last
 
 

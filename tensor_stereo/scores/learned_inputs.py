@@ -15,6 +15,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.relations import shared_neighbors
+from tensor_stereo.scores.alignment import Alignment, align_matches
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.types import Adjacency, Matches
 
@@ -67,18 +68,23 @@ class Quantities(NamedTuple):
 
 
 def measure_quantities(
-    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None = None, config: FilterConfig | None = None
+    matches: Matches,
+    graphs: MatchGraphs,
+    evidence: ImageEvidence | None = None,
+    config: FilterConfig | None = None,
+    alignment: Alignment | None = None,
 ) -> Quantities:
     """Collect what the network sees.
 
     Nothing depends on the order of the matches, on the other pairs, on a common shift of both views, or on a shift of
-    one of them along the rows.
+    one of them along the rows; and next to nothing on what the alignment takes out.
 
     Args:
         matches: B pairs; without ``cost`` its columns are zero.
         graphs: graphs of the same matches.
         evidence: evidence of the images; None: its columns are zero.
         config: ``backend`` is read; None means the defaults.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
     Returns:
         The quantities. Gradients flow from all that is continuous in the keypoints, and are finite; none through
@@ -97,6 +103,7 @@ def measure_quantities(
     check_fit(matches, graphs, evidence)
     batch = ptr_to_batch(matches.ptr)
     share = (1 / matches.ptr.diff().double()).index_select(0, batch)[:, None]
+    matches = matches if alignment is None else align_matches(matches, alignment)
     points = [_center(view, matches.num_pairs, batch, share) for view in (matches.keypoints0, matches.keypoints1)]
     disparity = matches.keypoints0[:, :1].double() - matches.keypoints1[:, :1].double()
     row_offset = (matches.keypoints0[:, 1].double() - matches.keypoints1[:, 1].double()).abs().float()

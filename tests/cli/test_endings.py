@@ -144,7 +144,8 @@ def test_rates_without_any_known_truth_fail(release: Path, tmp_path: Path, capsy
 @pytest.mark.filterwarnings("ignore:the score expects rectified pairs")
 def test_an_empty_result_of_matches_that_agree_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = np.random.default_rng(0).random((200, 2)) * [320, 240]
-    table = pl.DataFrame(np.hstack([points, points + np.array([-12, 9])]), schema=["x0", "y0", "x1", "y1"])
+    turned = points @ np.array([[0.8, -0.6], [0.6, 0.8]])
+    table = pl.DataFrame(np.hstack([points, turned]), schema=["x0", "y0", "x1", "y1"])
     table.write_csv(tmp_path / "m.csv")
     out = tmp_path / "made" / "kept.csv"
     assert ends(["filter", str(tmp_path / "m.csv"), "--out", str(out), "--score", "consensus"]) == 1

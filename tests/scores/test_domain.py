@@ -25,6 +25,13 @@ def wrong_rows(rows: float, wrong: float = 0.3) -> ts.Matches:
     return pair(right + torch.tensor([0.0, rows]), left)
 
 
+def turned(degrees: float) -> ts.Matches:
+    left = scene(2, 200)[0]
+    angle = math.radians(degrees)
+    turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return pair((left - 160) @ turn.T + 160, left)
+
+
 def marks(matches: ts.Matches, **settings: object) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -35,21 +42,20 @@ def marks(matches: ts.Matches, **settings: object) -> list[str]:
 
 @pytest.mark.parametrize("score", ["learned", "consensus"])
 @pytest.mark.parametrize("rows", [1.0, -1.0, 40.0])
-def test_a_row_offset_gets_one_warning_that_says_what_to_set(rows: float, score: str) -> None:
-    (text,) = marks(wrong_rows(rows), score=score)
+def test_a_row_offset_is_taken_out_and_no_matter_for_a_warning(rows: float, score: str) -> None:
+    assert not marks(wrong_rows(rows), score=score)
+
+
+@pytest.mark.parametrize("score", ["learned", "consensus"])
+@pytest.mark.parametrize("degrees", [8.0, 20.0, -45.0])
+def test_a_turned_view_gets_one_warning_that_says_what_to_set(degrees: float, score: str) -> None:
+    (text,) = marks(turned(degrees), score=score)
     for words in ("rectified pairs", "of pair 0", "consensus=UNRECTIFIED", "'cardinality'"):
         assert words in text
 
 
-def test_a_turned_view_is_off_its_rows_on_either_side() -> None:
-    left = scene(2, 200)[0]
-    angle = math.radians(20)
-    turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    assert len(marks(pair((left - 160) @ turn.T + 160, left))) == 1
-
-
 def test_of_a_batch_there_is_one_warning_with_the_number_of_pairs() -> None:
-    good, bad = wrong_rows(0.0), wrong_rows(2.0)
+    good, bad = wrong_rows(0.0), turned(20.0)
     (text,) = marks(collate_matches([good, bad, good, bad]))
     assert "2 of 4 pairs" in text
     (text,) = marks(collate_matches([good, bad, good]))

@@ -12,6 +12,7 @@ struct ConsensusMatches {
     const std::int64_t* ptr;     // (num_pairs + 1) offsets
     std::int64_t num_pairs;
     const double* cost;           // one per match, or null
+    const double* row_shift;      // one per match: expected y in view 1 less y in view 0, px; or null
     const std::int64_t* crow[2];  // one more than matches; offsets
     const std::int64_t* cols[2];  // rows of the neighbours
 };

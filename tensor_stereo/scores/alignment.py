@@ -1,0 +1,163 @@
+"""Alignment: what all matches of a pair share, which says nothing about one of them.
+
+The cameras of a rectified pair are seldom calibrated to a fraction of a pixel: view 1 lies some rows higher or lower
+than it should, and drifts slowly over the image. The matches that agree with their neighbours tell by how much.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.batching import ptr_to_batch
+from tensor_stereo.graphs import MatchGraphs, check_match_graphs
+from tensor_stereo.types import Matches
+
+_LEAST_AGREEING = 12  # matches that a fit needs
+_LEAST_VOTES = 3  # of neighbours, counted in each view
+_ROW_PX, _DISPARITY_PX, _SLOPE = 1.0, 2.0, 0.2  # how far two neighbours that agree may differ, the last per px of way
+_MAX_OFFSET_PX, _BIN_PX = 256, 2  # the first guess of the offset is the middle of the fullest bins
+_SCALES_PX = (6.0, 4.0, 2.7, 1.8, 1.2, 0.8, 0.5, 0.5)  # of the noise, round by round
+_SLOPE_PRIOR = 0.02  # standard deviation of the drift, px/px
+_LEAST_SHIFT_PX = 0.1  # what is smaller all over the pair is none
+_MAX_DRIFT = 0.05  # px/px; what drifts more is not rectified
+_FIT_PX = 1.5  # most of the matches that agree must lie that near to their rows
+
+
+class Alignment(NamedTuple):
+    """Where the rows of view 0 lie in view 1: ``y1 - y0 = a + b x0 + c y0`` for the matches that agree.
+
+    Attributes:
+        coefficients: (B, 3) float64, a in px and b, c in px per px; zero where nothing was fitted.
+        fitted: (B,) bool, whether enough matches agree on it. Where they do not, scores expect rows to be the same.
+    """
+
+    coefficients: Tensor
+    fitted: Tensor
+
+    def select(self, start: int, stop: int) -> Alignment:
+        """That of pairs ``start`` to ``stop - 1``."""
+        return Alignment(self.coefficients[start:stop], self.fitted[start:stop])
+
+    def row_shift(self, keypoints0: Tensor, ptr: Tensor) -> Tensor:
+        """(M,) float64 px, by how much the row of every match in view 1 is expected below that in view 0."""
+        a, b, c = self.coefficients.index_select(0, ptr_to_batch(ptr)).unbind(1)
+        x, y = keypoints0.detach().double().unbind(1)
+        return a + b * x + c * y
+
+
+def align_matches(matches: Matches, alignment: Alignment) -> Matches:
+    """The matches with view 1 moved such that partners lie on one row. Gradients flow to the keypoints.
+
+    >>> points = torch.tensor([[1.0, 2.0]])
+    >>> alignment = Alignment(torch.tensor([[3.0, 0.5, 0.0]], dtype=torch.float64), torch.tensor([True]))
+    >>> align_matches(Matches(points, points, torch.tensor([0, 1])), alignment).keypoints1
+    tensor([[ 1.0000, -1.5000]], dtype=torch.float64)
+    """
+    shift = alignment.row_shift(matches.keypoints0, matches.ptr)
+    moved = matches.keypoints1.double() - torch.stack([torch.zeros_like(shift), shift], 1)
+    return Matches(matches.keypoints0.double(), moved, matches.ptr, matches.cost, matches.group)
+
+
+@torch.no_grad()
+def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
+    """Fit row offset and slow row drift of every pair to the matches that agree with their neighbours.
+
+    Two neighbours agree if their row offsets and their disparities are alike, which no common shift changes. The fit is
+    least squares, reweighted with ever smaller tolerance until wrong matches among them have no say (the weights of
+    Geman & McClure 1987).
+
+    Args:
+        matches: B pairs of views that are rectified up to the alignment, coordinates in px.
+        graphs: The graphs of the same matches.
+
+    Returns:
+        The alignment of every pair. It is zero where it stays below 0.1 px for all matches that agree. A pair does not
+        depend on the others. No gradient.
+
+    Raises:
+        ValueError: for graphs of another number of matches.
+
+    Example:
+        >>> from tensor_stereo.graphs import build_match_graphs
+        >>> left = torch.rand(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
+        >>> right = left + torch.stack([torch.full((200,), -5.0), 2 + 0.01 * left[:, 0]], 1)
+        >>> right[:60] = right[:60].flip(0)
+        >>> matches = Matches(left, right, torch.tensor([0, 200]))
+        >>> estimate_alignment(matches, build_match_graphs(matches)).coefficients.round(decimals=2)
+        tensor([[2.0000, 0.0100, 0.0000]], dtype=torch.float64)
+    """
+    check_match_graphs(matches, graphs)
+    batch, num_pairs = ptr_to_batch(matches.ptr), matches.num_pairs
+    points = matches.keypoints0.double()
+    offset = matches.keypoints1[:, 1].double() - points[:, 1]
+    agrees = _agreeing(matches, graphs, offset)
+    weight = agrees.double()
+    count = _sums(weight, batch, num_pairs)
+    means = [_sums(weight * values, batch, num_pairs) / count.clamp(min=1) for values in points.unbind(1)]
+    middle = torch.stack(means, 1)
+    centered = points - middle.index_select(0, batch)  # so that offset and drift hardly depend on each other
+    level = _fullest(offset, weight, batch, num_pairs)
+    fit = torch.stack([level, torch.zeros_like(level), torch.zeros_like(level)], 1)
+    for scale_px in _SCALES_PX:
+        relative = (offset - _at(fit, centered, batch)) / scale_px
+        fit = _solve(weight / (1 + relative.square()).square(), centered, offset, scale_px, batch, num_pairs)
+    fitted_offset = _at(fit, centered, batch)
+    near = agrees & ((offset - fitted_offset).abs() <= _FIT_PX)
+    is_slow = (fit[:, 1:].abs() <= _MAX_DRIFT).all(1)
+    fitted = (count >= _LEAST_AGREEING) & is_slow & (2 * _sums(near.double(), batch, num_pairs) >= count)
+    moved = torch.where(agrees, fitted_offset.abs(), 0)
+    largest = moved.new_zeros(num_pairs).scatter_reduce(0, batch, moved, "amax")
+    a, b, c = fit.unbind(1)
+    coefficients = torch.stack([a - b * middle[:, 0] - c * middle[:, 1], b, c], 1)
+    keep = fitted & (largest >= _LEAST_SHIFT_PX)
+    return Alignment(torch.where(keep[:, None], coefficients, 0), fitted)
+
+
+def _agreeing(matches: Matches, graphs: MatchGraphs, offset: Tensor) -> Tensor:
+    """(M,) bool, whether several neighbours of a match, counted in each view, move as it does."""
+    disparity = matches.keypoints0[:, 0].double() - matches.keypoints1[:, 0].double()
+    votes = torch.zeros_like(matches.ptr[:1]).expand(matches.num_matches).clone()
+    for view, adjacency in ((matches.keypoints0, graphs.adjacency0), (matches.keypoints1, graphs.adjacency1)):
+        i, j = adjacency.row_indices, adjacency.col_indices
+        way = (view.index_select(0, i) - view.index_select(0, j)).double().norm(dim=1)
+        near_row = (offset.index_select(0, i) - offset.index_select(0, j)).abs() <= _ROW_PX
+        gap = (disparity.index_select(0, i) - disparity.index_select(0, j)).abs()
+        votes.index_add_(0, i, (near_row & (gap <= _DISPARITY_PX + _SLOPE * way)).to(votes.dtype))
+    return votes >= _LEAST_VOTES
+
+
+def _at(fit: Tensor, centered: Tensor, batch: Tensor) -> Tensor:
+    a, b, c = fit.index_select(0, batch).unbind(1)
+    return a + b * centered[:, 0] + c * centered[:, 1]
+
+
+def _fullest(offset: Tensor, weight: Tensor, batch: Tensor, num_pairs: int) -> Tensor:
+    """(B,) middle of the three neighbouring bins of offsets that hold the most matches."""
+    num_bins = 2 * _MAX_OFFSET_PX // _BIN_PX
+    place = ((offset + _MAX_OFFSET_PX) / _BIN_PX).floor().clamp(1, num_bins - 2).long()
+    counts = weight.new_zeros(num_pairs * num_bins).index_add(0, batch * num_bins + place, weight)
+    counts = counts.reshape(num_pairs, num_bins)
+    three = counts[:, :-2] + counts[:, 1:-1] + counts[:, 2:]
+    return (three.argmax(1) + 1.5) * _BIN_PX - _MAX_OFFSET_PX
+
+
+def _solve(weight: Tensor, centered: Tensor, offset: Tensor, scale_px: float, batch: Tensor, num_pairs: int) -> Tensor:
+    """(B, 3) weighted least squares, by cofactors; a drift of zero counts as an observation."""
+    x, y = centered.unbind(1)
+    wx, wy = weight * x, weight * y
+    columns = (weight, wx, wy, wx * x, wx * y, wy * y, weight * offset, wx * offset, wy * offset)
+    one, sx, sy, sxx, sxy, syy, r0, rx, ry = (_sums(column, batch, num_pairs) for column in columns)
+    ridge = (scale_px / _SLOPE_PRIOR) ** 2
+    one, sxx, syy = one + 1e-9, sxx + ridge, syy + ridge
+    c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
+    c11, c12, c22 = one * syy - sy * sy, sx * sy - one * sxy, one * sxx - sx * sx
+    solved = (c00 * r0 + c01 * rx + c02 * ry, c01 * r0 + c11 * rx + c12 * ry, c02 * r0 + c12 * rx + c22 * ry)
+    return torch.stack(solved, 1) / (one * c00 + sx * c01 + sy * c02)[:, None]
+
+
+def _sums(values: Tensor, batch: Tensor, num_pairs: int) -> Tensor:
+    """(B,) sums over the matches of each pair."""
+    return values.new_zeros(num_pairs).index_add(0, batch, values)

@@ -19,7 +19,7 @@ _LEAST_AGREEING = 12  # matches that a fit needs
 _LEAST_VOTES = 3  # of neighbours, counted in each view
 _ROW_PX, _DISPARITY_PX, _SLOPE = 1.0, 2.0, 0.2  # how far two neighbours that agree may differ, the last per px of way
 _MAX_OFFSET_PX, _BIN_PX = 256, 2  # the first guess of the offset is the middle of the fullest bins
-_SCALES_PX = (6.0, 4.0, 2.7, 1.8, 1.2, 0.8, 0.5, 0.5)  # of the noise, round by round
+_SCALES_PX = (6.0, 3.0, 1.5, 0.8, 0.5)  # of the noise, round by round
 _SLOPE_PRIOR = 0.02  # standard deviation of the drift, px/px
 _LEAST_SHIFT_PX = 0.1  # what is smaller all over the pair is none
 _MAX_DRIFT = 0.05  # px/px; what drifts more is not rectified
@@ -90,48 +90,48 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
         tensor([[2.0000, 0.0100, 0.0000]], dtype=torch.float64)
     """
     check_match_graphs(matches, graphs)
-    batch, num_pairs = ptr_to_batch(matches.ptr), matches.num_pairs
-    points = matches.keypoints0.double()
-    offset = matches.keypoints1[:, 1].double() - points[:, 1]
-    agrees = _agreeing(matches, graphs, offset)
-    weight = agrees.double()
-    count = _sums(weight, batch, num_pairs)
-    means = [_sums(weight * values, batch, num_pairs) / count.clamp(min=1) for values in points.unbind(1)]
-    middle = torch.stack(means, 1)
-    centered = points - middle.index_select(0, batch)  # so that offset and drift hardly depend on each other
-    level = _fullest(offset, weight, batch, num_pairs)
-    fit = torch.stack([level, torch.zeros_like(level), torch.zeros_like(level)], 1)
+    num_pairs = matches.num_pairs
+    y = matches.keypoints0[:, 1].double()
+    offset = matches.keypoints1[:, 1].double() - y
+    rows = _agreeing(matches, graphs, offset).nonzero()[:, 0]  # only these have a say
+    batch = ptr_to_batch(matches.ptr).index_select(0, rows)
+    x, y, offset = (v.index_select(0, rows) for v in (matches.keypoints0[:, 0].double(), y, offset))
+    one = torch.ones_like(x)
+    count = _sums(one, batch, num_pairs)
+    middle = [_sums(values, batch, num_pairs) / count.clamp(min=1) for values in (x, y)]
+    # from the middle, so that offset and drift hardly depend on each other
+    x, y = (values - mean.index_select(0, batch) for values, mean in zip((x, y), middle, strict=True))
+    fit = [_fullest(offset, one, batch, num_pairs), torch.zeros_like(count), torch.zeros_like(count)]
     for scale_px in _SCALES_PX:
-        relative = (offset - _at(fit, centered, batch)) / scale_px
-        fit = _solve(weight / (1 + relative.square()).square(), centered, offset, scale_px, batch, num_pairs)
-    fitted_offset = _at(fit, centered, batch)
-    near = agrees & ((offset - fitted_offset).abs() <= _FIT_PX)
-    is_slow = (fit[:, 1:].abs() <= _MAX_DRIFT).all(1)
-    fitted = (count >= _LEAST_AGREEING) & is_slow & (2 * _sums(near.double(), batch, num_pairs) >= count)
-    moved = torch.where(agrees, fitted_offset.abs(), 0)
-    largest = moved.new_zeros(num_pairs).scatter_reduce(0, batch, moved, "amax")
-    a, b, c = fit.unbind(1)
-    coefficients = torch.stack([a - b * middle[:, 0] - c * middle[:, 1], b, c], 1)
+        relative = (offset - _at(fit, x, y, batch)) / scale_px
+        fit = _solve(1 / (1 + relative.square()).square(), x, y, offset, scale_px, batch, num_pairs)
+    fitted_offset = _at(fit, x, y, batch)
+    near = ((offset - fitted_offset).abs() <= _FIT_PX).to(one)
+    is_slow = (fit[1].abs() <= _MAX_DRIFT) & (fit[2].abs() <= _MAX_DRIFT)
+    fitted = (count >= _LEAST_AGREEING) & is_slow & (2 * _sums(near, batch, num_pairs) >= count)
+    largest = torch.zeros_like(count).scatter_reduce(0, batch, fitted_offset.abs(), "amax")
+    a, b, c = fit
+    coefficients = torch.stack([a - b * middle[0] - c * middle[1], b, c], 1)
     keep = fitted & (largest >= _LEAST_SHIFT_PX)
     return Alignment(torch.where(keep[:, None], coefficients, 0), fitted)
 
 
 def _agreeing(matches: Matches, graphs: MatchGraphs, offset: Tensor) -> Tensor:
     """(M,) bool, whether several neighbours of a match, counted in each view, move as it does."""
-    disparity = matches.keypoints0[:, 0].double() - matches.keypoints1[:, 0].double()
-    votes = torch.zeros_like(matches.ptr[:1]).expand(matches.num_matches).clone()
-    for view, adjacency in ((matches.keypoints0, graphs.adjacency0), (matches.keypoints1, graphs.adjacency1)):
+    x = matches.keypoints0[:, 0].double()
+    seen = torch.stack([offset, x - matches.keypoints1[:, 0].double(), x], 1).float()
+    votes = torch.zeros_like(offset, dtype=torch.int32)
+    for adjacency in (graphs.adjacency0, graphs.adjacency1):
         i, j = adjacency.row_indices, adjacency.col_indices
-        way = (view.index_select(0, i) - view.index_select(0, j)).double().norm(dim=1)
-        near_row = (offset.index_select(0, i) - offset.index_select(0, j)).abs() <= _ROW_PX
-        gap = (disparity.index_select(0, i) - disparity.index_select(0, j)).abs()
-        votes.index_add_(0, i, (near_row & (gap <= _DISPARITY_PX + _SLOPE * way)).to(votes.dtype))
+        rows, disparities, way = (seen.index_select(0, i) - seen.index_select(0, j)).abs_().unbind(1)
+        agrees = (rows <= _ROW_PX) & (disparities <= _DISPARITY_PX + _SLOPE * way)
+        votes.index_add_(0, i, agrees.to(votes.dtype))
     return votes >= _LEAST_VOTES
 
 
-def _at(fit: Tensor, centered: Tensor, batch: Tensor) -> Tensor:
-    a, b, c = fit.index_select(0, batch).unbind(1)
-    return a + b * centered[:, 0] + c * centered[:, 1]
+def _at(fit: list[Tensor], x: Tensor, y: Tensor, batch: Tensor) -> Tensor:
+    a, b, c = (values.index_select(0, batch) for values in fit)
+    return a + b * x + c * y
 
 
 def _fullest(offset: Tensor, weight: Tensor, batch: Tensor, num_pairs: int) -> Tensor:
@@ -144,9 +144,10 @@ def _fullest(offset: Tensor, weight: Tensor, batch: Tensor, num_pairs: int) -> T
     return (three.argmax(1) + 1.5) * _BIN_PX - _MAX_OFFSET_PX
 
 
-def _solve(weight: Tensor, centered: Tensor, offset: Tensor, scale_px: float, batch: Tensor, num_pairs: int) -> Tensor:
-    """(B, 3) weighted least squares, by cofactors; a drift of zero counts as an observation."""
-    x, y = centered.unbind(1)
+def _solve(
+    weight: Tensor, x: Tensor, y: Tensor, offset: Tensor, scale_px: float, batch: Tensor, num_pairs: int
+) -> list[Tensor]:
+    """Three (B,) coefficients by weighted least squares, by cofactors; a drift of zero counts as an observation."""
     wx, wy = weight * x, weight * y
     columns = (weight, wx, wy, wx * x, wx * y, wy * y, weight * offset, wx * offset, wy * offset)
     one, sx, sy, sxx, sxy, syy, r0, rx, ry = (_sums(column, batch, num_pairs) for column in columns)
@@ -155,7 +156,8 @@ def _solve(weight: Tensor, centered: Tensor, offset: Tensor, scale_px: float, ba
     c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
     c11, c12, c22 = one * syy - sy * sy, sx * sy - one * sxy, one * sxx - sx * sx
     solved = (c00 * r0 + c01 * rx + c02 * ry, c01 * r0 + c11 * rx + c12 * ry, c02 * r0 + c12 * rx + c22 * ry)
-    return torch.stack(solved, 1) / (one * c00 + sx * c01 + sy * c02)[:, None]
+    determinant = one * c00 + sx * c01 + sy * c02
+    return [values / determinant for values in solved]
 
 
 def _sums(values: Tensor, batch: Tensor, num_pairs: int) -> Tensor:

@@ -238,10 +238,10 @@ def _write_group(group: Any, found: _Found, verdicts: Verdicts) -> None:
     for name in _earlier(group, "putative_matches0"):
         del group[name]
         taken.remove(name)
-    results = _results(found, verdicts, "putative_matches0", taken)
-    for name, values in results.items():
+    results = _results(found, verdicts, taken)
+    for name, values in {"putative_matches0": found.stored, **results}.items():
         group.create_dataset(name, data=values)
-    group["putative_matches0"].attrs[_NOTE] = [name for name in results if name != "putative_matches0"]
+    group["putative_matches0"].attrs[_NOTE] = list(results)
     group["matches0"][...] = np.where(~indices.mask | verdicts.spread(indices.mask).inlier, found.stored, -1)
     if found.pair.form == "glue-factory" and "matches1" in group:
         partner = group["matches1"][()]
@@ -251,12 +251,12 @@ def _write_group(group: Any, found: _Found, verdicts: Verdicts) -> None:
         group["matches1"][...] = partner
 
 
-def _results(found: _Found, verdicts: Verdicts, mark: str, taken: set[str]) -> dict[str, Any]:
-    """Results by their names. ``mark`` is the array as it was, and tells the results of an earlier filter."""
+def _results(found: _Found, verdicts: Verdicts, taken: set[str]) -> dict[str, Any]:
+    """Results by their names."""
     wide = verdicts.spread(found.indices.mask)
     score = None if wide.score is None else wide.score.astype(np.float32)
     names = name_results(found.pair.path, taken)
-    results = {mark: found.stored, names.inlier: wide.inlier, names.score: score, names.relation: wide.relation}
+    results = {names.inlier: wide.inlier, names.score: score, names.relation: wide.relation}
     return {name: values for name, values in results.items() if values is not None}
 
 
@@ -275,8 +275,8 @@ def _replace_dataset(file: Any, found: _Found, verdicts: Verdicts) -> None:
     old = file[found.pair.path].attrs
     earlier = _earlier(old, "putative_matches")
     attributes = {name: value for name, value in old.items() if name not in earlier}
-    results = _results(found, verdicts, "putative_matches", set(attributes))
-    attributes |= results | {_NOTE: [name for name in results if name != "putative_matches"]}
+    results = _results(found, verdicts, set(attributes))
+    attributes |= {"putative_matches": stored, **results, _NOTE: list(results)}
     del file[found.pair.path]
     dataset = file.create_dataset(found.pair.path, data=stored[keep] if found.in_rows else stored[:, keep])
     for name, values in attributes.items():

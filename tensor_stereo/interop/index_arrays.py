@@ -97,11 +97,9 @@ def _read_indices(
 ) -> Indices:
     sizes = num_keypoints[::-1] if name == "matches1" else num_keypoints
     per_keypoint = name in ("matches0", "matches1")
-    # (1, 2) is one match, or one pair with two keypoints.
-    has_batch_axis = array.ndim == 2 and len(array) == 1 and (per_keypoint or array.shape[1] != 2 or is_batch)
-    if has_batch_axis and array.shape[1] == 2 and sizes[0] != 2:
-        has_batch_axis = per_keypoint
-    of_both = not per_keypoint and not has_batch_axis and array.ndim >= 2
+    # (1, 2) is one match, or the partners of two keypoints with a batch axis of one
+    is_one_match = array.shape[1:] == (2,) and not (is_batch and sizes[0] == 2)
+    of_both = not per_keypoint and array.ndim >= 2 and (len(array) != 1 or array.ndim > 2 or is_one_match)
     values = _whole_numbers(place, name, array)
     if of_both:
         rows = one_pair(place, name, values, 2)

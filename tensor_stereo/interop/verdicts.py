@@ -41,14 +41,9 @@ class FilterSummary:
         """The counts with those of ``num_pairs`` more pairs."""
         num_matches, num_kept = len(verdicts.inlier), int(verdicts.inlier.sum())
         num_untested = int((verdicts.relation == Relation.UNTESTED).sum())
-        return FilterSummary(
-            self.num_pairs + num_pairs,
-            self.num_matches + num_matches,
-            self.num_kept + num_kept,
-            self.num_rejected + num_matches - num_kept - num_untested,
-            self.num_untested + num_untested,
-            self.num_agreeing + int(((verdicts.relation > 0) & (verdicts.relation < Relation.CONFLICT)).sum()),
-        )
+        num_agreeing = int(((verdicts.relation > 0) & (verdicts.relation < Relation.CONFLICT)).sum())
+        num_rejected = num_matches - num_kept - num_untested
+        return self + FilterSummary(num_pairs, num_matches, num_kept, num_rejected, num_untested, num_agreeing)
 
     def __add__(self, other: FilterSummary) -> FilterSummary:
         return FilterSummary(*(mine + more for mine, more in zip(astuple(self), astuple(other), strict=True)))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
@@ -28,6 +29,7 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
+from tensor_stereo.scores.tolerance import NUM_TOLERANCES, rising
 from tensor_stereo.types import Adjacency, Matches
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
@@ -51,7 +53,7 @@ class LearnedScore(nn.Module):
         num_rounds: of messages.
     """
 
-    calibration: Tensor  # (2,) slope and bias
+    calibration: Tensor  # (5, 2) slope and bias at each tolerance
 
     def __init__(self, width: int = _WIDTH, edge_width: int = _EDGE_WIDTH, num_rounds: int = _ROUNDS) -> None:
         super().__init__()
@@ -60,7 +62,7 @@ class LearnedScore(nn.Module):
         self.enter_out = nn.Linear(width, width)
         self.rounds = nn.ModuleList(MessageRound(width, edge_width, plane=k > 1) for k in range(num_rounds))
         self.head = nn.Linear(width, width)
-        self.last = nn.Linear(width, 1)
+        self.last = nn.Linear(width, NUM_TOLERANCES)
         self.head_whole = nn.Linear(width, width, bias=False)
         sizes = {
             "nodes": NUM_NODE,
@@ -72,7 +74,7 @@ class LearnedScore(nn.Module):
         for name, size in sizes.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
-        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0]).repeat(NUM_TOLERANCES, 1))
 
     def forward(
         self,
@@ -82,7 +84,7 @@ class LearnedScore(nn.Module):
         config: FilterConfig | None = None,
         alignment: Alignment | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Logit, as trained, and calibrated probability of each match being correct.
+        """Logits, as trained, and calibrated probabilities of each match being correct within each tolerance.
 
         Args:
             matches: B pairs; ``cost`` may be missing.
@@ -92,14 +94,15 @@ class LearnedScore(nn.Module):
             alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
         Returns:
-            (M,) float32 each. Gradients flow to the keypoints from all that is continuous in them, and are finite.
+            (M, 5) float32 each, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`. Gradients flow to the keypoints
+            from all that is continuous in them, and are finite.
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
             logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config, alignment))
             return logit, self.calibrate(logit)
 
     def infer(self, q: Quantities) -> tuple[Tensor, list[Tensor]]:
-        """(M,) logits, and those after the start and each round but the last, which training looks at too."""
+        """(M, 5) logits, and (M,) those after the start and each round but the last, which training looks at too."""
         with_image = q.shown
         cost = self._normalize("cost", q.cost) * q.has_cost
         entered = self.enter(torch.cat([self._normalize("nodes", q.nodes), cost, q.has_cost, q.has_image], 1))
@@ -115,13 +118,12 @@ class LearnedScore(nn.Module):
             state, belief = messages(state, q, with_image)
             beliefs.append(belief)
         whole = self.head_whole(_pair_mean(state, q)).index_select(0, q.batch)
-        logit: Tensor = self.last((self.head(state) + whole).relu())[:, 0]
-        return logit, beliefs
+        return _cumulative(self.last((self.head(state) + whole).relu())), beliefs
 
     def calibrate(self, logit: Tensor) -> Tensor:
-        """(M,) probability; logistic regression on the logit (Platt 1999), fitted on scenes left out of training."""
-        slope, bias = self.calibration
-        return torch.sigmoid(slope * logit + bias)
+        """(M, 5) probability; logistic regression on the logits (Platt 1999), fitted on scenes left out of training."""
+        slope, bias = self.calibration.unbind(1)
+        return rising(torch.sigmoid(slope * logit + bias))
 
     def _normalize(self, name: str, values: Tensor) -> Tensor:
         mean, scale = getattr(self, f"{name}_mean"), getattr(self, f"{name}_scale")
@@ -163,6 +165,15 @@ class MessageRound(nn.Module):
         whole = self.whole(_pair_mean(state, q)).index_select(0, q.batch)
         mixed = self.mix(torch.cat(known, 1)) + whole
         return self.norm(state + self.out(mixed.relu())), belief[:, 0]
+
+
+def _cumulative(outputs: Tensor) -> Tensor:
+    """(M, 5) logits that grow with the tolerance: that of 1 px, and steps down and up from it."""
+    half, one, two, three, five = outputs.unbind(1)
+    columns = [one - functional.softplus(half), one]
+    for step in (two, three, five):
+        columns.append(columns[-1] + functional.softplus(step))
+    return torch.stack(columns, 1)
 
 
 def _pair_mean(state: Tensor, q: Quantities) -> Tensor:

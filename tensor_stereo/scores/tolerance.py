@@ -1,0 +1,50 @@
+"""Tolerances: how far off a match may be and still count as correct, and the probability that goes with each."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tensor_stereo.configs import LEAST_ERROR_PX, MOST_ERROR_PX
+
+TOLERANCES_PX = (LEAST_ERROR_PX, 1.0, 2.0, 3.0, MOST_ERROR_PX)  # at which scores predict; between them, linearly
+NUM_TOLERANCES = len(TOLERANCES_PX)
+
+
+def probability_within(cumulative: Tensor, max_error_px: float) -> Tensor:
+    """The probability of an error of at most ``max_error_px``.
+
+    Args:
+        cumulative: (..., 5) probabilities of an error of at most each of :data:`TOLERANCES_PX`, which do not fall.
+        max_error_px: From .5 to 5 px; linear between the tolerances.
+
+    Returns:
+        (...) in the dtype of ``cumulative``; it never falls when ``max_error_px`` grows. Gradients flow.
+
+    Raises:
+        ValueError: for a tolerance outside of .5 to 5 px.
+
+    >>> probability_within(torch.tensor([0.1, 0.3, 0.5, 0.6, 0.8]), 1.5)
+    tensor(0.4000)
+    """
+    if not LEAST_ERROR_PX <= max_error_px <= MOST_ERROR_PX:
+        raise ValueError(
+            f"max_error_px must lie between {LEAST_ERROR_PX:g} and {MOST_ERROR_PX:g} px, got {max_error_px}"
+        )
+    k = max(k for k in range(NUM_TOLERANCES - 1) if TOLERANCES_PX[k] <= max_error_px)
+    low, high = TOLERANCES_PX[k : k + 2]
+    below, above = cumulative[..., k], cumulative[..., k + 1]
+    share = (max_error_px - low) / (high - low)
+    return below + share * (above - below) if share < 1 else above
+
+
+def rising(values: Tensor) -> Tensor:
+    """The same (..., 5) values, each at least as large as those of smaller tolerances.
+
+    >>> rising(torch.tensor([0.2, 0.1, 0.4, 0.4, 0.3]))
+    tensor([0.2000, 0.2000, 0.4000, 0.4000, 0.4000])
+    """
+    columns = [values[..., 0]]
+    for k in range(1, NUM_TOLERANCES):
+        columns.append(torch.maximum(columns[-1], values[..., k]))
+    return torch.stack(columns, -1)

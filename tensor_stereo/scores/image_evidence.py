@@ -24,14 +24,20 @@ MAX_DISPARITIES = 256  # of one pair's search range
 _RADIUS_PX = 7  # of the largest window
 _NEAR_PX = 3  # disparities on either side of the match that are looked at one by one
 _SAME_PX = 2  # a rival is farther from the match than that
+_SLOPE_GAP_PX, _STEEPEST, _SLOPE_REACH_PX, _SLOPE_RIDGE, _SLOPE_MISS_PX = 2.0, 0.5, 40.0, 40.0, 1.0
 _NOISE_VARIANCE = 2.0  # grey levels squared; keeps windows without texture from deciding
 _NOWHERE = 20.0  # log SSD of a place outside of the image
 _TIE = 1e-3  # log SSDs that near are alike; rounding must not choose between them
 _MAX_LOG = 6.0  # log ratios of SSDs are cut there
 _LIKENESS_LEVELS, _LIKENESS_PX2 = 12.0, 40.0  # fall-off of the weights of pixels unlike the centre
 _ROWS_AT_ONCE = 192  # matches whose windows stay in the cache
-_WHOLE, _HALF = 3, 4  # whole windows, which are also held against the row, and half windows
-NUM_VALUES = 2 * (_WHOLE * (2 * _NEAR_PX + 1 + 7) + 2 * _HALF + 1) + 2
+_TIGHT_LEVELS, _TIGHT_PX2 = 10.0, 8.0  # the same around the pixel of the keypoint itself
+_WHOLE, _HALF = 4, 4  # whole windows, which are also held against the row, and half windows
+_CURVES = 2  # of the whole windows, the last: those of pixels like the centre
+_PLACES = 2 * _NEAR_PX + 1
+_SLANTED = (1, 2)  # the whole windows that are also compared along the slope of the surface
+_SLANTED_VALUES = len(_SLANTED) * (_PLACES + 3)
+NUM_VALUES = 2 * (_WHOLE * (_PLACES + 7) + 2 * _HALF + 1 + _SLANTED_VALUES) + 2
 
 
 class ImageEvidence(NamedTuple):
@@ -57,6 +63,7 @@ class ImageEvidence(NamedTuple):
     curve1: Tensor
     first: Tensor
     num_columns: Tensor
+    offset: Tensor
 
 
 @torch.no_grad()
@@ -96,6 +103,7 @@ def measure_images(
     ]
     check_match_graphs(matches, graphs)
     ranges = search_ranges(matches if alignment is None else align_matches(matches, alignment), graphs)
+    slope = local_slopes(matches, graphs)
     row_shift = matches.keypoints0.new_zeros(matches.num_matches).float()
     if alignment is not None:
         row_shift = alignment.row_shift(matches.keypoints0, matches.ptr).float()
@@ -107,11 +115,11 @@ def measure_images(
             for row in range(start, stop, _ROWS_AT_ONCE):
                 rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
                 points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
-                parts.append(_measure_both(gray, points, row_shift[rows], *ranges[b], width))
-    values, curve0, curve1 = (torch.cat(part) for part in zip(*parts, strict=True))
+                parts.append(_measure_both(gray, points, row_shift[rows], slope[rows], *ranges[b], width))
+    values, curve0, curve1, offset = (torch.cat(part) for part in zip(*parts, strict=True))
     spread = torch.tensor(ranges, dtype=torch.int64, device=matches.ptr.device).reshape(-1, 2)
     first, count = spread.repeat_interleave(matches.ptr.diff(), 0).unbind(1)
-    return ImageEvidence(values, curve0, curve1, first.float(), count)
+    return ImageEvidence(values, curve0, curve1, first.float(), count, offset)
 
 
 def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]]:
@@ -156,27 +164,30 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
 
 def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
     none = torch.zeros(0, dtype=torch.float32, device=like.device)
-    return none.reshape(0, NUM_VALUES), none.reshape(0, width), none.reshape(0, width)
+    return none.reshape(0, NUM_VALUES), *(none.reshape(0, _CURVES, width),) * 2, none
 
 
 def _measure_both(
-    gray: Sequence[Tensor], points: Sequence[Tensor], row_shift: Tensor, first: int, count: int, width: int
+    gray: Sequence[Tensor], points: Sequence[Tensor], row_shift: Tensor, slope: Tensor, first: int, count: int, width: int
 ) -> tuple[Tensor, ...]:
     """Values and both curves of m matches of one pair."""
     own = (points[0][:, 0] - points[1][:, 0] - first).round()  # column of the match
-    columns, curves, levels = [], [], []
+    columns, curves, levels, offsets = [], [], [], []
+    rate = 1 / (1 - slope[:, :1])  # of view 1 against view 0
     for view in (0, 1):
         windows = _sample(gray[view], points[view], _RADIUS_PX)
         row = points[view][:, 1] + (-row_shift if view else row_shift)  # in the other view
-        side, curve = _measure_one(
-            gray[1 - view], windows, points[view], row, points[1 - view], own, first, count, view
+        shear = slope * rate if view else -slope
+        side, curve, offset = _measure_one(
+            gray[1 - view], windows, points[view], row, points[1 - view], own, first, count, view, shear
         )
+        offsets.append(offset)
         columns += side
         curves.append(torch.nn.functional.pad(curve, (0, width - count)))
         levels.append(windows[:, 4:-4, 4:-4].mean((1, 2)))
     brighter = (levels[0] - levels[1]).abs() / 16
     beyond = torch.log1p((-own).clamp(min=0) + (own - count + 1).clamp(min=0)).clamp(max=5)
-    return torch.cat([*columns, brighter[:, None], beyond[:, None]], 1), *curves
+    return torch.cat([*columns, brighter[:, None], beyond[:, None]], 1), *curves, sum(offsets) / 2
 
 
 def _measure_one(
@@ -189,7 +200,8 @@ def _measure_one(
     first: int,
     count: int,
     view: int,
-) -> tuple[list[Tensor], Tensor]:
+    shear: Tensor,
+) -> tuple[list[Tensor], Tensor, Tensor]:
     """Values of the windows of one view, held against the image of the other, and their curve."""
     kernels = _window_kernels(windows)
     near = _sample(other, partners, _RADIUS_PX + _NEAR_PX)
@@ -197,6 +209,11 @@ def _measure_one(
     if not view:  # disparity grows against the columns of view 1
         cost, likeness = cost.flip(1), likeness.flip(1)
     mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
+    slanted = _sample_slanted(other, partners, shear)
+    along, along_likeness, _ = _compare(windows, slanted, kernels[..., list(_SLANTED)])
+    if not view:
+        along, along_likeness = along.flip(1), along_likeness.flip(1)
+    offset = _lowest_place(along)
     # the row of the window itself, but for the alignment: there lies a rectified partner
     toward = 1 if view else -1  # way of growing disparity in the other view
     x = points[:, :1] + toward * (first + torch.arange(count, device=points.device))  # (m, D)
@@ -232,8 +249,62 @@ def _measure_one(
         (mid - lowest)[:, _WHOLE:],
         variance[:, :_WHOLE],
         gradient[:, None],
+        (along - along.amin(1, keepdim=True)).flatten(1),
+        along[:, _NEAR_PX] - mid[:, list(_SLANTED)],
+        along_likeness[:, _NEAR_PX],
+        offset,
     ]
-    return columns, (far[..., 2] - mid[:, 2, None]).clamp(-_MAX_LOG, _MAX_LOG)
+    curve = (far[..., -_CURVES:] - whole[:, None, -_CURVES:]).clamp(-_MAX_LOG, _MAX_LOG)
+    return columns, curve.transpose(1, 2), offset[:, -1]
+
+
+def _lowest_place(cost: Tensor) -> Tensor:
+    """(m, K) px from the middle place to the lowest, by the parabola through it and both beside it."""
+    k = cost.argmin(1, keepdim=True).clamp(1, _PLACES - 2)
+    before, least, after = (cost.gather(1, k + step)[:, 0] for step in (-1, 0, 1))
+    bend = (before - 2 * least + after).clamp(min=1e-3)
+    return (k[:, 0] - _NEAR_PX) + ((before - after) / (2 * bend)).clamp(-1, 1)
+
+
+def _sample_slanted(image: Tensor, centers: Tensor, shear: Tensor) -> Tensor:
+    """(m, 15, 21) grey levels around sub-pixel centres, with columns moved by the shear of the place; bilinear."""
+    height, width = image.shape
+    v = torch.arange(-_RADIUS_PX, _RADIUS_PX + 1, device=image.device, dtype=torch.float32)[:, None]
+    reach = _RADIUS_PX + _NEAR_PX
+    u = torch.arange(-reach, reach + 1, device=image.device, dtype=torch.float32)
+    x = (centers[:, 0, None, None] + u + shear[:, 0, None, None] * u + shear[:, 1, None, None] * v).clamp(0, width - 1)
+    y = (centers[:, 1, None, None] + v).clamp(0, height - 1)
+    x0, y0 = x.floor(), y.floor()
+    fx, fy = x - x0, y - y0
+    left, top = x0.long(), y0.long()
+    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+    flat = image.reshape(-1)
+    rows = [flat[row * width + left] * (1 - fx) + flat[row * width + right] * fx for row in (top, bottom)]
+    return rows[0] + fy * (rows[1] - rows[0])
+
+
+def local_slopes(matches: Matches, graphs: MatchGraphs) -> Tensor:
+    """(M, 2) float32 px/px, how the disparity changes with x and y of view 0 around every match."""
+    x, y = matches.keypoints0.double().unbind(1)
+    disparity = matches.disparity.double()
+    ends = [torch.cat([getattr(a, name) for a in (graphs.adjacency0, graphs.adjacency1)]) for name in ("row_indices", "col_indices")]
+    dx, dy, gap = (values[ends[1]] - values[ends[0]] for values in (x, y, disparity))
+    length = (dx * dx + dy * dy).sqrt()
+    weight = (gap.abs() <= (_SLOPE_GAP_PX + _STEEPEST * length)).double() / (1 + (gap / (1 + 0.2 * length)) ** 2)
+    a = b = torch.zeros_like(x)
+    near = 1 / (1 + (length / _SLOPE_REACH_PX) ** 2)
+    for _ in range(4):
+        wx, wy = weight * near * dx, weight * near * dy
+        xx, xy, yy, gx, gy = (
+            torch.zeros_like(x).index_add(0, ends[0], column)
+            for column in (wx * dx, wx * dy, wy * dy, wx * gap, wy * gap)
+        )
+        xx, yy = xx + _SLOPE_RIDGE, yy + _SLOPE_RIDGE
+        determinant = xx * yy - xy * xy
+        a, b = (gx * yy - gy * xy) / determinant, (gy * xx - gx * xy) / determinant
+        miss = gap - a[ends[0]] * dx - b[ends[0]] * dy
+        weight = 1 / (1 + (miss / _SLOPE_MISS_PX).square()).square()
+    return torch.stack([a, b], 1).clamp(-_STEEPEST, _STEEPEST).float()
 
 
 def _sample(image: Tensor, centers: Tensor, radius_x: int) -> Tensor:
@@ -267,8 +338,11 @@ def _window_kernels(windows: Tensor) -> Tensor:
     boxes = torch.stack([small, middle, *halves]).float().expand(len(windows), -1, -1, -1)
     center = windows[:, _RADIUS_PX - 1 : _RADIUS_PX + 2, _RADIUS_PX - 1 : _RADIUS_PX + 2].mean((1, 2))
     unlike = (windows - center[:, None, None]).abs() / _LIKENESS_LEVELS
-    similar = torch.exp(-unlike - (x.square() + y.square()).float() / _LIKENESS_PX2)[:, None] + 1e-4
-    weights = torch.cat([boxes[:, :2], similar, boxes[:, 2:]], 1).flatten(2)
+    far = (x.square() + y.square()).float()
+    similar = torch.exp(-unlike - far / _LIKENESS_PX2)[:, None] + 1e-4
+    unlike = (windows - windows[:, _RADIUS_PX, _RADIUS_PX, None, None]).abs() / _TIGHT_LEVELS
+    tight = torch.exp(-unlike - far / _TIGHT_PX2)[:, None] + 1e-5
+    weights = torch.cat([boxes[:, :2], similar, tight, boxes[:, 2:]], 1).flatten(2)
     return (weights / weights.sum(2, keepdim=True)).transpose(1, 2)
 
 

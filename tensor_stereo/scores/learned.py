@@ -25,6 +25,7 @@ from tensor_stereo.scores.learned_inputs import (
     NUM_EDGE,
     NUM_EDGE_IMAGE,
     NUM_NODE,
+    NUM_ODD,
     Quantities,
     check_fit,
     measure_quantities,
@@ -143,10 +144,11 @@ class MessageRound(nn.Module):
         super().__init__()
         self.ends = nn.Linear(width, 2 * edge_width)
         self.edge = nn.Linear(NUM_EDGE, edge_width, bias=False)
+        self.odd = nn.Linear(NUM_ODD, edge_width, bias=False)
         self.edge_image = nn.Linear(NUM_EDGE_IMAGE, edge_width, bias=False)
         self.belief = nn.Linear(width, 1)
         self.plane = plane
-        self.mix = nn.Linear(width + edge_width + _NUM_PLANE * plane, width)
+        self.mix = nn.Linear(width + edge_width + 2 * _NUM_PLANE * plane, width)
         self.whole = nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
         self.norm = nn.LayerNorm(width)
@@ -154,14 +156,18 @@ class MessageRound(nn.Module):
     def forward(self, state: Tensor, q: Quantities, with_image: bool) -> tuple[Tensor, Tensor]:
         """(M, width) state and (M,) logit of the belief before it."""
         ends = self.ends(state)
-        between = self.edge(q.edges)
+        between, odd = self.edge(q.edges), self.odd(q.odd)
         (hear_i, tell_i), (hear_j, tell_j) = (ends.index_select(0, rows).chunk(2, 1) for rows in (q.i, q.j))
-        to_i, to_j = (between + hear_i).add_(tell_j), (between + hear_j).add_(tell_i)
+        to_i, to_j = (between + hear_i).add_(tell_j).add_(odd), (between + hear_j).add_(tell_i).sub_(odd)
         if with_image:
             to_i, to_j = to_i.add_(self.edge_image(q.image_i)), to_j.add_(self.edge_image(q.image_j))
         heard = q.receivers.sum(to_i.relu_(), to_j.relu_()) / q.degree
         belief = self.belief(state)
-        known = [state, heard, _plane_residual(torch.sigmoid(belief), q)] if self.plane else [state, heard]
+        known = [state, heard]
+        if self.plane:
+            trust = torch.sigmoid(belief)
+            known.append(_plane_residual(trust, q, q.disparity))
+            known.append(_plane_residual(trust, q, q.refined) * q.has_image if with_image else torch.zeros_like(known[-1]))
         whole = self.whole(_pair_mean(state, q)).index_select(0, q.batch)
         mixed = self.mix(torch.cat(known, 1)) + whole
         return self.norm(state + self.out(mixed.relu())), belief[:, 0]
@@ -181,17 +187,18 @@ def _pair_mean(state: Tensor, q: Quantities) -> Tensor:
     return state.new_zeros(q.num_pairs, state.shape[1]).index_add(0, q.batch, state * q.share)
 
 
-def _plane_residual(weight: Tensor, q: Quantities) -> Tensor:
+def _plane_residual(weight: Tensor, q: Quantities, other: Tensor) -> Tensor:
     """(M, 9) how far each disparity is from the plane, and from the mean, through those of the weighted neighbours."""
     x, y = q.step.clamp(-4, 4).unbind(1)
-    gap = q.disparity.index_select(0, q.j) - q.disparity.index_select(0, q.i)
-    gap = gap.clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
-    even = torch.stack([torch.ones_like(x), x * x, x * y, y * y, gap * x, gap * y])
-    odd = torch.stack([x, y, gap])  # turn their sign with the way
+    gap_i, gap_j = (
+        (other.index_select(0, far) - q.disparity.index_select(0, near)).clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
+        for near, far in ((q.i, q.j), (q.j, q.i))
+    )
+    shared = torch.stack([torch.ones_like(x), x * x, x * y, y * y])
     weight = weight[:, 0]
-    to_i = torch.cat([even, odd]) * weight.index_select(0, q.j)
-    to_j = torch.cat([even, -odd]) * weight.index_select(0, q.i)
-    total, xx, xy, yy, gx, gy, sx, sy, sg = q.receivers.sum(to_i.t(), to_j.t()).unbind(1)
+    to_i = torch.cat([shared, torch.stack([x, y, gap_i * x, gap_i * y, gap_i])]) * weight.index_select(0, q.j)
+    to_j = torch.cat([shared, torch.stack([-x, -y, -gap_j * x, -gap_j * y, gap_j])]) * weight.index_select(0, q.i)
+    total, xx, xy, yy, sx, sy, gx, gy, sg = q.receivers.sum(to_i.t(), to_j.t()).unbind(1)
     safe = total + 0.01
     mean_x, mean_y, mean_gap = sx / safe, sy / safe, sg / safe
     xx, yy = xx - total * mean_x * mean_x + _RIDGE, yy - total * mean_y * mean_y + _RIDGE

@@ -19,7 +19,7 @@ from tensor_stereo.scores.alignment import Alignment, align_matches
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.types import Adjacency, Matches
 
-NUM_NODE, NUM_COST, NUM_EDGE, NUM_EDGE_IMAGE = 8, 2, 14, 3
+NUM_NODE, NUM_COST, NUM_EDGE, NUM_ODD, NUM_EDGE_IMAGE = 8, 2, 15, 2, 9
 _TINY_PX2 = 1e-6  # added to squared lengths, so that their roots have a gradient at coincident points
 
 
@@ -53,12 +53,14 @@ class Quantities(NamedTuple):
     has_cost: Tensor  # (M, 1) 0 or 1
     has_image: Tensor  # (M, 1) 0 or 1
     disparity: Tensor  # (M,) px, less the mean of the pair
+    refined: Tensor  # (M,) px, the disparity that the images favour nearby; the same without images
     batch: Tensor  # (M,) int64 pair of each match
     share: Tensor  # (M, 1) one over the number of matches of the pair
     degree: Tensor  # (M, 1) neighbours in either view, at least 1
     i: Tensor  # (U,) int64 rows
     j: Tensor  # (U,) int64 rows, greater than i
     edges: Tensor  # (U, NUM_EDGE), the same for both ends
+    odd: Tensor  # (U, NUM_ODD), from i to j; the other way they change their sign
     image_i: Tensor  # (U, NUM_EDGE_IMAGE) the disparity of j in the windows of i
     image_j: Tensor  # (U, NUM_EDGE_IMAGE) the disparity of i in the windows of j
     step: Tensor  # (U, 2) from i to j in view 0, over the mean distance of both to their neighbours
@@ -114,7 +116,7 @@ def measure_quantities(
         cost, has_cost = _relative_cost(matches.cost.detach().double(), matches.ptr, batch)
     i, j, in0, in1 = _union(graphs.adjacency0, graphs.adjacency1)
     receivers = find_receivers(i, j, len(nodes))
-    edges, step, length = _edge_quantities(torch.cat(points, 1), i, j, in0, in1)
+    edges, odd, step, length = _edge_quantities(torch.cat(points, 1), i, j, in0, in1)
     mean_length = (receivers.sum(length[:, None], length[:, None])[:, 0] / degree).clamp(min=1e-3)
     step = 2 * step / (mean_length.index_select(0, i) + mean_length.index_select(0, j))
     if evidence is None:
@@ -124,9 +126,16 @@ def measure_quantities(
         image, has_image = evidence.values, (evidence.num_columns > 0)[:, None].float()
         image_i, image_j = (_look_up(evidence, disparity.detach()[:, 0], *ends) for ends in ((i, j), (j, i)))
     centered = _center(disparity, matches.num_pairs, batch, share)[:, 0]
+    refined = centered
+    if evidence is not None:
+        refined = centered + evidence.offset
+        gap = (refined.index_select(0, j) - refined.index_select(0, i)).detach()
+        plain = (centered.index_select(0, j) - centered.index_select(0, i)).detach()
+        extra = torch.stack([torch.exp(gap.abs() / -0.3), torch.exp(-gap.abs()), torch.log1p(gap.abs()), torch.exp((gap.abs()) / -0.3 / length.detach().clamp(min=1) * 8)], 1)
+        image_i, image_j = (torch.cat([x, extra], 1) for x in (image_i, image_j))
     return Quantities(
-        nodes, cost, image, has_cost, has_image, centered, batch, share.float(), degree[:, None],
-        i, j, edges, image_i, image_j, step.t(), receivers, matches.num_pairs, evidence is not None,
+        nodes, cost, image, has_cost, has_image, centered, refined, batch, share.float(), degree[:, None],
+        i, j, edges, odd, image_i, image_j, step.t(), receivers, matches.num_pairs, evidence is not None,
     )  # fmt: skip
 
 
@@ -231,11 +240,12 @@ def _union(adjacency0: Adjacency, adjacency1: Adjacency) -> tuple[Tensor, Tensor
     return i, keys - i * size, in0, in1
 
 
-def _edge_quantities(points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(U, NUM_EDGE) quantities; (2, U) way from i to j in view 0 and (U,) its length in px."""
+def _edge_quantities(points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(U, NUM_EDGE) quantities; (U, NUM_ODD) those that change sign with the way; (2, U) way from i to j in view 0 and (U,) its length in px."""
     x0, y0, x1, y1 = (points.index_select(0, j) - points.index_select(0, i)).t().contiguous()
     length0, length1 = ((x.square() + y.square() + _TINY_PX2).sqrt() for x, y in ((x0, y0), (x1, y1)))
-    gap, row_gap = (x0 - x1).abs(), (y0 - y1).abs()  # px, of the disparities and of the offsets between rows
+    step = x0 - x1
+    gap, row_gap = step.abs(), (y0 - y1).abs()  # px, of the disparities and of the offsets between rows
     log_length, relative = torch.log(length0), gap / length0
     same = torch.exp(gap / -0.7)
     columns = [
@@ -253,19 +263,25 @@ def _edge_quantities(points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Ten
         torch.log(length1) - log_length,
         same * in0 * in1,
         y0.abs() / length0,
+        torch.tanh(step / 4) * x0 / length0,  # is the nearer one on the right?
     ]
-    return torch.stack(columns).t(), torch.stack([x0, y0]), length0
+    odd = torch.stack([torch.tanh(step / 2), torch.tanh(step / 8)])
+    return torch.stack(columns).t(), odd.t(), torch.stack([x0, y0]), length0
 
 
 def _look_up(evidence: ImageEvidence, disparity: Tensor, i: Tensor, j: Tensor) -> Tensor:
-    """(U, 3) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
-    width = evidence.curve0.shape[1]
+    """(U, 5) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
+    _, num_curves, width = evidence.curve0.shape
     if not width:
-        return evidence.values.new_zeros(len(i), NUM_EDGE_IMAGE)
+        return evidence.values.new_zeros(len(i), 2 * num_curves + 1)
     other = disparity.index_select(0, j)  # float64
     column = (other - evidence.first.index_select(0, i)).round().long()
     known = (column >= 0) & (column < evidence.num_columns.index_select(0, i))
-    place = torch.where(known, column, 0) + i * width
+    place = torch.where(known, column, 0) + i * width * num_curves
     far = known & ((other - disparity.index_select(0, i)).abs() >= 0.5)
-    values = [curve.reshape(-1).index_select(0, place) * far for curve in (evidence.curve0, evidence.curve1)]
+    values = [
+        curve.reshape(-1).index_select(0, place + k * width) * far
+        for curve in (evidence.curve0, evidence.curve1)
+        for k in range(num_curves)
+    ]
     return torch.stack([*values, known.float()], 1)

@@ -36,6 +36,8 @@ FOLDS = (
     ("Flowerpots", "Rocks1", "Wood1", "barn1"),
 )  # each network of the cross-validation is trained without the scenes, and without the drives, of one fold
 
+NUM_FOLDS = len(FOLDS)
+
 
 class Views(NamedTuple):
     """Grey images (H, W) uint8 and disparities (H, W) float32 px, NaN where unknown; None if not published."""
@@ -67,7 +69,7 @@ def list_scenes(data: Path, more: Path | None) -> list[Scene]:
         for files in find_pairs(root) if root is not None else ():
             domain = _DOMAINS.get(files.dataset)
             if domain is not None:
-                scenes.append(Scene(files.scene, domain, _fold(files.scene), files))
+                scenes.append(Scene(files.scene, domain, fold_of(files.scene), files))
     scenes += [Scene(*found) for found in _rendered(more)] if more is not None else []
     scenes += [Scene(f"synthetic-{k}", "synthetic", None, k) for k in range(NUM_SYNTHETIC)]
     return scenes
@@ -87,12 +89,17 @@ def read_views(scene: Scene) -> Views:
     return Views(gray0, gray1, pair.disparity_gt.numpy(), disparity1)
 
 
-def _fold(name: str) -> int:
+def fold_of(name: str) -> int | None:
+    """The fold that leaves a scene out; None if it is always in training.
+
+    >>> fold_of("Aloe"), fold_of("000040_10"), fold_of("synthetic-3")
+    (0, 3, None)
+    """
     frame = re.fullmatch(r"(\d{6})_10", name)
     if frame is not None:
         number = int(frame[1])
         return next((k for k, block in enumerate(_KITTI_BLOCKS) if number in block), len(_KITTI_BLOCKS))
-    return next(k for k, names in enumerate(FOLDS) if name in names)
+    return next((k for k, names in enumerate(FOLDS) if name in names), None)
 
 
 def _rendered(root: Path) -> list[tuple[str, str, None, tuple[Path, Path, Path]]]:

@@ -1,10 +1,10 @@
-"""Train the learned score, cross-validate it over scenes, calibrate it, write its weights.
+"""Train the learned score, cross-validate it over scenes and drives, calibrate it, write its weights.
 
-    python benchmarks/training/train_learned.py DATA/middlebury WORK weights.safetensors
+    python benchmarks/training/train_learned.py DATA TRAINING_DATA WORK weights.safetensors
 
-WORK receives the records of every scene (about 200 MB), and the weights and the figures of the cross-validation.
-Everything follows from the seeds below; each training runs on one thread. The eight scenes of the paper (2003, 2005)
-are never read.
+DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read. WORK receives
+the putatives of every scene and what the network sees of them (2 GB), and the weights and the figures of the
+cross-validation. Everything follows from the seeds below; each training runs on one thread.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import multiprocessing
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -29,41 +30,64 @@ from torch.nn import functional
 
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, roc_update
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores import LearnedScore
+from tensor_stereo.scores import LearnedScore, measure_images
+from tensor_stereo.scores.alignment import estimate_alignment
 from tensor_stereo.scores.learned_inputs import Quantities, find_receivers, measure_quantities
+from tensor_stereo.scores.tolerance import TOLERANCES_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
+from shared.calibration_error import calibration_error
 from training.platt_scaling import fit_calibration
-from training.records import NUM_SYNTHETIC, Record, make_records, read_scenes, render_views
-from training.work_folder import FOLDS, fold_weights, load_records, records_path
+from training.putatives import Putatives, find_putatives
+from training.scenes import NUM_FOLDS, Scene, list_scenes
+from training.work_folder import fold_weights, items_path, putatives_path
 
-SEED, EPOCHS, PAIRS_AT_ONCE = 0, 6, 8
+SEED, EPOCHS, PAIRS_AT_ONCE = 0, 14, 8
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-3
 DROP_IMAGE, DROP_COST = 0.15, 0.30  # share of the pairs that are shown without
 BELIEF_WEIGHT = 0.2  # of the loss on the beliefs between rounds
+_TOLERANCES = torch.tensor(TOLERANCES_PX)
+_ONE, _TWO = TOLERANCES_PX.index(1), TOLERANCES_PX.index(2)
 
 
 class Item(NamedTuple):
+    """Putatives as the network sees them."""
+
+    domain: str
+    kind: str
+    fixed: bool
     quantities: Quantities
-    valid: Tensor
-    correct: Tensor
+    known: Tensor  # (M, 5) bool, whether the truth can judge each tolerance
+    correct: Tensor  # (M, 5) bool
 
 
-def make_scene(work: Path, data: Path, job: tuple[str, int]) -> None:
+def record_scene(work: Path, scene: Scene, number: int) -> None:
+    """Write the putatives of a scene, unless they are there."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    scene, number = job
-    real = not scene.startswith("synthetic")
-    views = read_scenes(data)[scene] if real else render_views(number)
-    torch.save(make_records(scene, number, views, real=real), records_path(work, scene))
+    path = putatives_path(work, scene.name)
+    if not path.exists():
+        torch.save(find_putatives(scene, number), path)
 
 
-def to_item(record: Record) -> Item:
-    quantities = measure_quantities(record.matches, build_match_graphs(record.matches), record.evidence)
-    return Item(quantities, record.valid, record.correct)
+def measure_scene(work: Path, scene: Scene) -> None:
+    """Write what the network sees of the putatives of a scene."""
+    torch.set_num_threads(1)
+    found = torch.load(putatives_path(work, scene.name), weights_only=False)
+    torch.save([to_item(one) for one in found], items_path(work, scene.name))
 
 
-def collate(items: list[Item], shown: list[tuple[bool, bool]]) -> tuple[Quantities, Tensor, Tensor]:
+def to_item(given: Putatives) -> Item:
+    matches, graphs = given.matches, build_match_graphs(given.matches)
+    alignment = estimate_alignment(matches, graphs)
+    evidence = measure_images(*([image] for image in given.images), matches, graphs, alignment)
+    quantities = measure_quantities(matches, graphs, evidence, alignment=alignment)
+    error = given.error_px[:, None]
+    known = error.isfinite() & (given.least_error_px <= _TOLERANCES)
+    return Item(given.domain, given.kind, given.fixed, quantities, known, error <= _TOLERANCES)
+
+
+def collate(items: Sequence[Item], shown: Sequence[tuple[bool, bool]]) -> tuple[Quantities, Tensor, Tensor]:
     """One batch, with cost and images of each pair shown or not."""
     parts = [item.quantities for item in items]
     lengths = torch.tensor([len(part.nodes) for part in parts])
@@ -78,18 +102,18 @@ def collate(items: list[Item], shown: list[tuple[bool, bool]]) -> tuple[Quantiti
     receivers = find_receivers(joined["i"], joined["j"], len(batch))
     any_image = bool(joined["has_image"].any())
     whole = Quantities(batch=batch, receivers=receivers, num_pairs=len(items), shown=any_image, **joined)
-    return whole, torch.cat([item.valid for item in items]), torch.cat([item.correct for item in items])
+    return whole, torch.cat([item.known for item in items]), torch.cat([item.correct for item in items])
 
 
 _ROWS = [n for n in Quantities._fields if n not in ("i", "j", "batch", "receivers", "num_pairs", "shown")]
 
 
-def fit_scales(network: LearnedScore, items: list[Item]) -> None:
+def fit_scales(network: LearnedScore, items: Sequence[Item]) -> None:
     """Mean and one over the standard deviation of every quantity."""
     q, _, _ = collate(items, [(True, True)] * len(items))
     seen = {
         "nodes": q.nodes,
-        "cost": q.cost,
+        "cost": q.cost[q.has_cost[:, 0] > 0],
         "image": q.image,
         "edges": q.edges,
         "edge_image": torch.cat([q.image_i, q.image_j]),
@@ -99,7 +123,7 @@ def fit_scales(network: LearnedScore, items: list[Item]) -> None:
         getattr(network, f"{name}_scale").copy_(1 / values.std(0).clamp(min=0.05))
 
 
-def train(items: list[Item]) -> LearnedScore:
+def train(items: Sequence[Item]) -> LearnedScore:
     torch.manual_seed(SEED)
     rng = np.random.default_rng(SEED)
     network = LearnedScore()
@@ -121,83 +145,123 @@ def train(items: list[Item]) -> LearnedScore:
     return network.eval()
 
 
-def loss_of(network: LearnedScore, q: Quantities, valid: Tensor, correct: Tensor) -> Tensor:
-    """Cross-entropy; a pair weighs as the root of the number of its matches."""
-    count = q.share.new_zeros(q.num_pairs).index_add(0, q.batch, valid.float())
-    weight = valid / count.clamp(min=1).sqrt()[q.batch]
-    weight, target = weight / weight.sum().clamp(min=1e-6), correct.float()
+def loss_of(network: LearnedScore, q: Quantities, known: Tensor, correct: Tensor) -> Tensor:
+    """Cross-entropy over all tolerances that the truth can judge; a pair weighs as the root of its number of matches."""
+    judged = known.any(1)
+    count = q.share.new_zeros(q.num_pairs).index_add(0, q.batch, judged.float())
+    weight = count.clamp(min=1).rsqrt()[q.batch]
     logit, beliefs = network.infer(q)
-    loss = functional.binary_cross_entropy_with_logits(logit, target, weight, reduction="sum")
+    loss = _cross_entropy(logit, correct, weight[:, None] * known)
+    target = torch.where(known[:, _ONE], correct[:, _ONE], correct[:, _TWO])
     for belief in beliefs[1:]:
-        between = functional.binary_cross_entropy_with_logits(belief, target, weight, reduction="sum")
-        loss = loss + BELIEF_WEIGHT * between
+        loss = loss + BELIEF_WEIGHT * _cross_entropy(belief, target, weight * judged)
     return loss
 
 
+def _cross_entropy(logit: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    weight = weight / weight.sum().clamp(min=1e-6)
+    return functional.binary_cross_entropy_with_logits(logit, target.float(), weight, reduction="sum")
+
+
+def load_items(work: Path, scenes: Sequence[Scene]) -> list[Item]:
+    return [item for scene in scenes for item in torch.load(items_path(work, scene.name), weights_only=False)]
+
+
+class LeftOut(NamedTuple):
+    """What the network says of an item that it was trained without."""
+
+    domain: str
+    kind: str
+    fixed: bool
+    logit: Tensor  # (M, 5)
+    bare: Tensor  # (M, 5) without images
+    known: Tensor
+    correct: Tensor
+
+
 @torch.no_grad()
-def predict(network: LearnedScore, item: Item, shown: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
-    """Logits and truth of the matches whose truth is known."""
-    q, valid, correct = collate([item], [shown])
-    return network.infer(q)[0][valid], correct[valid]
-
-
-def cross_validate(work: Path, fold: int | None) -> dict[str, object]:
-    """Train without the scenes of a fold, or with all scenes if it is None; measure on the scenes left out."""
+def cross_validate(work: Path, scenes: Sequence[Scene], fold: int | None) -> tuple[dict[str, Tensor], list[LeftOut]]:
+    """Weights of a training without the scenes of a fold, or with all if it is None, and what they say of the others."""
     torch.set_num_threads(1)
     start = time.perf_counter()
-    held = FOLDS[fold] if fold is not None else ()
-    scenes = [scene for other in FOLDS for scene in other if scene not in held]
-    scenes += [f"synthetic-{k}" for k in range(NUM_SYNTHETIC)]
-    network = train([to_item(record) for record in load_records(work, scenes)])
-    figures, logits, truths, weights = defaultdict(list), [], [], []
-    for record in load_records(work, list(held)):
-        item = to_item(record)
-        logit, correct = predict(network, item, (True, True))
-        if not len(logit):
-            continue
-        logits.append(logit)
-        truths.append(correct)
-        weights.append(torch.full((len(logit),), len(logit) ** -0.5))
-        if record.fixed and 0 < correct.sum() < len(correct):
-            for name, shown in (("full", (True, True)), ("no image", (True, False)), ("bare", (False, False))):
-                logit, correct = predict(network, item, shown)
-                key = f"{name}: {record.detector}{', gated' if record.gated else ''}"
-                counts = roc_update(logit, correct)
-                figures[key].append((counts.auc(), counts.specificity_at(PAPER_SENSITIVITY)))
+    with torch.enable_grad():
+        network = train(load_items(work, [scene for scene in scenes if fold is None or scene.fold != fold]))
+    found = []
+    for item in load_items(work, [scene for scene in scenes if fold is not None and scene.fold == fold]):
+        logits = []
+        for shows_images in (True, False):
+            q, known, correct = collate([item], [(True, shows_images)])
+            logits.append(network.infer(q)[0])
+        found.append(LeftOut(item.domain, item.kind, item.fixed, *logits, known, correct))
     print(f"fold {fold}: {time.perf_counter() - start:.0f} s", flush=True)
-    left_out = [torch.cat(x) if x else torch.zeros(0) for x in (logits, truths, weights)]
-    return {"figures": dict(figures), "left out": left_out, "weights": network.state_dict()}
+    return network.state_dict(), found
+
+
+def calibrate(found: Sequence[LeftOut]) -> Tensor:
+    """(5, 2) slope and bias of each tolerance, over all matches whose truth can judge it."""
+    fitted = []
+    for k in range(len(TOLERANCES_PX)):
+        logit, correct, weight = [], [], []
+        for one in found:
+            rows = one.known[:, k]
+            logit.append(one.logit[rows, k])
+            correct.append(one.correct[rows, k])
+            weight.append(torch.full((int(rows.sum()),), max(int(rows.sum()), 1) ** -0.5))
+        fitted.append(fit_calibration(torch.cat(logit), torch.cat(correct), torch.cat(weight)))
+    return torch.stack(fitted)
+
+
+def report(found: Sequence[LeftOut], calibration: Tensor) -> dict[str, dict[str, list[float]]]:
+    """By domain, tolerance and kind: AUC, specificity, the same without images, and the calibration error."""
+    network = LearnedScore()
+    network.calibration.copy_(calibration)
+    figures, pooled = defaultdict(list), defaultdict(list)
+    for one in found:
+        probability = network.calibrate(one.logit)
+        for k, tolerance in enumerate(TOLERANCES_PX):
+            rows, key = one.known[:, k], f"{one.domain}, {tolerance:g} px, {one.kind}"
+            correct = one.correct[rows, k]
+            if not one.fixed or not len(correct):
+                continue
+            pooled[key].append((probability[rows, k], correct))
+            if 0 < correct.sum() < len(correct):
+                counts = [roc_update(logit[rows, k], correct) for logit in (one.logit, one.bare)]
+                figures[key].append([f for c in counts for f in (c.auc(), c.specificity_at(PAPER_SENSITIVITY))])
+    return {
+        key: {
+            "auc, specificity": np.mean(values, 0).round(4).tolist(),
+            "calibration error": round(calibration_error(*(torch.cat(x) for x in zip(*pooled[key], strict=True))), 4),
+        }
+        for key, values in figures.items()
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("work", type=Path)
-    parser.add_argument("out", type=Path)
+    for name in ("data", "training_data", "work", "out"):
+        parser.add_argument(name, type=Path)
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
-    real = sorted(read_scenes(options.data))
-    jobs = [(scene, k) for k, scene in enumerate(real)] + [(f"synthetic-{k}", k) for k in range(NUM_SYNTHETIC)]
-    missing = [job for job in jobs if not records_path(options.work, job[0]).exists()]
+    scenes = list_scenes(options.data, options.training_data)
+    numbers = range(len(scenes))
     with multiprocessing.get_context("spawn").Pool(options.processes) as pool:
-        pool.map(partial(make_scene, options.work, options.data), missing, chunksize=1)
-        print(f"{len(missing)} scenes: {time.perf_counter() - start:.0f} s", flush=True)
-        whole, *folds = pool.map(partial(cross_validate, options.work), [None, *range(len(FOLDS))], chunksize=1)
-    logit, correct, weight = (torch.cat([fold["left out"][k] for fold in folds]) for k in range(3))
-    calibration = fit_calibration(logit, correct.bool(), weight)
-    for result in (whole, *folds):
-        result["weights"]["calibration"] = calibration
-    for path, result in zip([options.out, *fold_weights(options.work)], [whole, *folds], strict=True):
-        save_file({name: values.contiguous() for name, values in result["weights"].items()}, path)
-    table = {
-        key: np.mean([x for fold in folds for x in fold["figures"].get(key, [])], 0).round(3).tolist()
-        for key in folds[0]["figures"]
-    }
-    report = {"cross-validation": table, "calibration": calibration.tolist()}
-    (options.work / "figures.json").write_text(json.dumps(report, indent=1))
-    print(json.dumps(report, indent=1), f"{time.perf_counter() - start:.0f} s", sep="\n")
+        start = time.perf_counter()
+        pool.starmap(partial(record_scene, options.work), zip(scenes, numbers, strict=True), chunksize=1)
+        print(f"putatives of {len(scenes)} scenes: {time.perf_counter() - start:.0f} s", flush=True)
+        start = time.perf_counter()
+        pool.map(partial(measure_scene, options.work), scenes, chunksize=1)
+        print(f"evidence: {time.perf_counter() - start:.0f} s", flush=True)
+        run = partial(cross_validate, options.work, scenes)
+        (whole, _), *folds = pool.map(run, [None, *range(NUM_FOLDS)], chunksize=1)
+    left_out = [one for _, found in folds for one in found]
+    calibration = calibrate(left_out)
+    for path, weights in zip([options.out, *fold_weights(options.work)], [whole, *(w for w, _ in folds)], strict=True):
+        weights["calibration"] = calibration
+        save_file({name: values.contiguous() for name, values in weights.items()}, path)
+    figures = {"calibration": calibration.tolist(), **report(left_out, calibration)}
+    (options.work / "figures.json").write_text(json.dumps(figures, indent=1))
+    print(json.dumps(figures, indent=1), f"{time.perf_counter() - start:.0f} s", sep="\n")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,8 @@ _LIKENESS_LEVELS, _LIKENESS_PX2 = 12.0, 40.0  # fall-off of the weights of pixel
 _ROWS_AT_ONCE = 192  # matches whose windows stay in the cache
 _TIGHT_LEVELS, _TIGHT_PX2 = 10.0, 8.0  # the same around the pixel of the keypoint itself
 _WHOLE, _HALF = 4, 4  # whole windows, which are also held against the row, and half windows
-_CURVES = 2  # of the whole windows, the last: those of pixels like the centre
+_TIGHT = 3  # whose mean counts as well
+_CURVES = 6  # the windows of pixels like the centre, and the half windows
 _PLACES = 2 * _NEAR_PX + 1
 _SLANTED = (1, 2)  # the whole windows that are also compared along the slope of the surface
 _SLANTED_VALUES = len(_SLANTED) * (_PLACES + 3)
@@ -112,6 +113,7 @@ def measure_images(
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
         for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
             gray = [to_gray(images[b][None])[0, 0].float() for images in views]
+            gray[1] = gray[1] - _brighter(gray, matches, start, stop)
             for row in range(start, stop, _ROWS_AT_ONCE):
                 rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
                 points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
@@ -160,6 +162,18 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
             last = first + MAX_DISPARITIES - 1
         ranges.append((first, last - first + 1))
     return ranges
+
+
+def _brighter(gray: Sequence[Tensor], matches: Matches, start: int, stop: int) -> Tensor:
+    """() by how many grey levels view 1 is brighter, the median over the matches of a pair."""
+    if start == stop:
+        return gray[0].new_zeros(())
+    levels = []
+    for image, points in zip(gray, (matches.keypoints0, matches.keypoints1), strict=True):
+        smooth = torch.nn.functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
+        x, y = points[start:stop].round().long().unbind(1)
+        levels.append(smooth[y.clamp(0, image.shape[0] - 1), x.clamp(0, image.shape[1] - 1)])
+    return (levels[1] - levels[0]).median()
 
 
 def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
@@ -213,15 +227,17 @@ def _measure_one(
     along, along_likeness, _ = _compare(windows, slanted, kernels[..., list(_SLANTED)])
     if not view:
         along, along_likeness = along.flip(1), along_likeness.flip(1)
-    offset = _lowest_place(along)
+    offset = _lowest_place(along.exp())
     # the row of the window itself, but for the alignment: there lies a rectified partner
     toward = 1 if view else -1  # way of growing disparity in the other view
     x = points[:, :1] + toward * (first + torch.arange(count, device=points.device))  # (m, D)
     left = x.amin(1) if count else points[:, 0]
     strip = _sample_strip(other, left - _RADIUS_PX, row, count + 2 * _RADIUS_PX)
-    far, far_likeness, _ = _compare(windows, strip, kernels[..., :_WHOLE])
+    far, far_likeness, _ = _compare(windows, strip, kernels)
     if not view:
         far, far_likeness = far.flip(1), far_likeness.flip(1)
+    curve = (far[..., -_CURVES:] - mid[:, None, -_CURVES:]).clamp(-_MAX_LOG, _MAX_LOG)
+    far, far_likeness = far[..., :_WHOLE], far_likeness[..., :_WHOLE]
     outside = ((x < 0) | (x > other.shape[1] - 1))[..., None]
     far, far_likeness = far.masked_fill(outside, _NOWHERE), far_likeness.masked_fill(outside, -1.0)
     place = torch.arange(count, device=own.device)
@@ -254,7 +270,6 @@ def _measure_one(
         along_likeness[:, _NEAR_PX],
         offset,
     ]
-    curve = (far[..., -_CURVES:] - whole[:, None, -_CURVES:]).clamp(-_MAX_LOG, _MAX_LOG)
     return columns, curve.transpose(1, 2), offset[:, -1]
 
 
@@ -363,5 +378,7 @@ def _compare(windows: Tensor, strips: Tensor, kernels: Tensor) -> tuple[Tensor, 
     variance = (squares - mean.square()).clamp(min=0)
     covariance = product - mean * anchor_mean[:, None]
     difference = (variance + anchor_variance[:, None] - 2 * covariance).clamp(min=0)
+    if k > _TIGHT:
+        difference[..., _TIGHT] += (mean - anchor_mean[:, None])[..., _TIGHT].square()
     scale = (variance + _NOISE_VARIANCE) * (anchor_variance[:, None] + _NOISE_VARIANCE)
     return torch.log(difference + _NOISE_VARIANCE), covariance / scale.sqrt(), torch.log(anchor_variance + 1)

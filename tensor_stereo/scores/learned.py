@@ -30,13 +30,17 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
-from tensor_stereo.scores.tolerance import NUM_TOLERANCES, rising
+from tensor_stereo.scores.tolerance import NUM_TOLERANCES, TOLERANCES_PX, rising
 from tensor_stereo.types import Adjacency, Matches
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
 _MATCHES_AT_ONCE = 8192  # whose edges stay in the cache, and are enough for two threads
 _WIDTH, _EDGE_WIDTH, _ROUNDS = 24, 12, 3
-_NUM_PLANE = 9
+_NUM_PLANE = 9 + NUM_TOLERANCES
+import os
+PLANE_FROM = int(os.environ.get("PF", 1))
+_NUM_PREDICTED = NUM_TOLERANCES + 2
+_SOFTNESS = 0.15  # of a tolerance
 _MAX_NORMALIZED = 4.0  # standard deviations
 _RIDGE = 0.3  # squared mean distances to neighbours; flattens planes that too few neighbours hold
 _MAX_GAP_PX = 64.0
@@ -61,7 +65,7 @@ class LearnedScore(nn.Module):
         self.enter = nn.Linear(NUM_NODE + NUM_COST + 2, width)
         self.enter_image = nn.Sequential(nn.Linear(NUM_VALUES, width), nn.ReLU(), nn.Linear(width, width, bias=False))
         self.enter_out = nn.Linear(width, width)
-        self.rounds = nn.ModuleList(MessageRound(width, edge_width, plane=k > 1) for k in range(num_rounds))
+        self.rounds = nn.ModuleList(MessageRound(width, edge_width, plane=k > PLANE_FROM) for k in range(num_rounds))
         self.head = nn.Linear(width, width)
         self.last = nn.Linear(width, NUM_TOLERANCES)
         self.head_whole = nn.Linear(width, width, bias=False)
@@ -148,6 +152,7 @@ class MessageRound(nn.Module):
         self.edge_image = nn.Linear(NUM_EDGE_IMAGE, edge_width, bias=False)
         self.belief = nn.Linear(width, 1)
         self.plane = plane
+        self.predicted = nn.Linear(_NUM_PREDICTED, edge_width, bias=False) if plane else None
         self.mix = nn.Linear(width + edge_width + 2 * _NUM_PLANE * plane, width)
         self.whole = nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
@@ -159,10 +164,13 @@ class MessageRound(nn.Module):
         between, odd = self.edge(q.edges), self.odd(q.odd)
         (hear_i, tell_i), (hear_j, tell_j) = (ends.index_select(0, rows).chunk(2, 1) for rows in (q.i, q.j))
         to_i, to_j = (between + hear_i).add_(tell_j).add_(odd), (between + hear_j).add_(tell_i).sub_(odd)
+        belief = self.belief(state)
+        if self.predicted is not None:
+            miss_i, miss_j = _predict(torch.sigmoid(belief), q)
+            to_i, to_j = to_i.add_(self.predicted(miss_i)), to_j.add_(self.predicted(miss_j))
         if with_image:
             to_i, to_j = to_i.add_(self.edge_image(q.image_i)), to_j.add_(self.edge_image(q.image_j))
         heard = q.receivers.sum(to_i.relu_(), to_j.relu_()) / q.degree
-        belief = self.belief(state)
         known = [state, heard]
         if self.plane:
             trust = torch.sigmoid(belief)
@@ -187,6 +195,37 @@ def _pair_mean(state: Tensor, q: Quantities) -> Tensor:
     return state.new_zeros(q.num_pairs, state.shape[1]).index_add(0, q.batch, state * q.share)
 
 
+def _predict(trust: Tensor, q: Quantities) -> tuple[Tensor, Tensor]:
+    """(U, K) how far the planes of the neighbours miss the disparity of either end."""
+    x, y = q.step.clamp(-4, 4).unbind(1)
+    trust = trust[:, 0]
+    gap = (q.refined.index_select(0, q.j) - q.refined.index_select(0, q.i)).clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
+    alike = torch.exp(-gap.abs() / (1 + (x * x + y * y).sqrt()) / 1.0)
+    shared = torch.stack([torch.ones_like(x), x * x, x * y, y * y, gap * x, gap * y])
+    odd = torch.stack([x, y, gap])
+    to_i = torch.cat([shared, odd]) * (trust.index_select(0, q.j) * alike)
+    to_j = torch.cat([shared, -odd]) * (trust.index_select(0, q.i) * alike)
+    n, xx, xy, yy, rx, ry, sx, sy, r0 = q.receivers.sum(to_i.t(), to_j.t()).unbind(1)
+    n, xx, yy = n + trust + 0.1, xx + _RIDGE, yy + _RIDGE  # the match itself counts too
+    c00, c01, c02 = xx * yy - xy * xy, xy * sy - sx * yy, sx * xy - xx * sy
+    c11, c12, c22 = n * yy - sy * sy, sx * sy - n * xy, n * xx - sx * sx
+    determinant = (n * c00 + sx * c01 + sy * c02).clamp(min=1e-4)
+    z = q.refined + (c00 * r0 + c01 * rx + c02 * ry) / determinant
+    a = (c01 * r0 + c11 * rx + c12 * ry) / determinant
+    b = (c02 * r0 + c12 * rx + c22 * ry) / determinant
+    misses = []
+    for near, far, way in ((q.i, q.j, -1), (q.j, q.i, 1)):
+        guess = z.index_select(0, far) + way * (a.index_select(0, far) * x + b.index_select(0, far) * y)
+        miss = (guess - q.disparity.index_select(0, near)).abs()
+        misses.append(torch.stack([*_within(miss), torch.log1p(miss), torch.exp(-miss / 0.3)], 1))
+    return misses[0], misses[1]
+
+
+def _within(miss: Tensor) -> list[Tensor]:
+    """For every tolerance, (M,) whether a miss is smaller, softly."""
+    return [torch.sigmoid((1 - miss / t) / _SOFTNESS) for t in TOLERANCES_PX]
+
+
 def _plane_residual(weight: Tensor, q: Quantities, other: Tensor) -> Tensor:
     """(M, 9) how far each disparity is from the plane, and from the mean, through those of the weighted neighbours."""
     x, y = q.step.clamp(-4, 4).unbind(1)
@@ -206,7 +245,7 @@ def _plane_residual(weight: Tensor, q: Quantities, other: Tensor) -> Tensor:
     gx, gy = gx - total * mean_gap * mean_x, gy - total * mean_gap * mean_y
     determinant = (xx * yy - xy * xy).clamp(min=1e-3)
     slope_x, slope_y = (gx * yy - gy * xy) / determinant, (gy * xx - gx * xy) / determinant
-    columns = []
+    columns = _within((mean_gap - slope_x * mean_x - slope_y * mean_y).abs())
     for residual in ((mean_gap - slope_x * mean_x - slope_y * mean_y).abs(), mean_gap.abs()):
         columns += [torch.exp(-residual / scale_px) for scale_px in (0.7, 2, 6)] + [torch.log1p(residual)]
     return torch.stack([*columns, torch.log1p(total)], 1)

@@ -19,7 +19,7 @@ from tensor_stereo.scores.alignment import Alignment, align_matches
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.types import Adjacency, Matches
 
-NUM_NODE, NUM_COST, NUM_EDGE, NUM_ODD, NUM_EDGE_IMAGE = 8, 2, 15, 2, 9
+NUM_NODE, NUM_COST, NUM_EDGE, NUM_ODD, NUM_EDGE_IMAGE = 8, 2, 15, 2, 13
 _TINY_PX2 = 1e-6  # added to squared lengths, so that their roots have a gradient at coincident points
 
 
@@ -124,7 +124,10 @@ def measure_quantities(
         image_i = image_j = edges.new_zeros(len(i), NUM_EDGE_IMAGE)
     else:
         image, has_image = evidence.values, (evidence.num_columns > 0)[:, None].float()
-        image_i, image_j = (_look_up(evidence, disparity.detach()[:, 0], *ends) for ends in ((i, j), (j, i)))
+        image_i, image_j = (
+            _look_up(evidence, disparity.detach()[:, 0], *ends, way)
+            for ends, way in (((i, j), step.detach()), ((j, i), -step.detach()))
+        )
     centered = _center(disparity, matches.num_pairs, batch, share)[:, 0]
     refined = centered
     if evidence is not None:
@@ -269,19 +272,23 @@ def _edge_quantities(points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Ten
     return torch.stack(columns).t(), odd.t(), torch.stack([x0, y0]), length0
 
 
-def _look_up(evidence: ImageEvidence, disparity: Tensor, i: Tensor, j: Tensor) -> Tensor:
-    """(U, 5) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
+def _look_up(evidence: ImageEvidence, disparity: Tensor, i: Tensor, j: Tensor, way: Tensor) -> Tensor:
+    """(U, 9) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
     _, num_curves, width = evidence.curve0.shape
     if not width:
-        return evidence.values.new_zeros(len(i), 2 * num_curves + 1)
+        return evidence.values.new_zeros(len(i), NUM_EDGE_IMAGE - 4)
     other = disparity.index_select(0, j)  # float64
     column = (other - evidence.first.index_select(0, i)).round().long()
     known = (column >= 0) & (column < evidence.num_columns.index_select(0, i))
     place = torch.where(known, column, 0) + i * width * num_curves
     far = known & ((other - disparity.index_select(0, i)).abs() >= 0.5)
+    dx, dy = way
+    sideways = dx.abs() >= dy.abs()
+    toward = torch.where(sideways, torch.where(dx > 0, 3, 2), torch.where(dy > 0, 5, 4))
+    away = torch.where(sideways, torch.where(dx > 0, 2, 3), torch.where(dy > 0, 4, 5))
     values = [
         curve.reshape(-1).index_select(0, place + k * width) * far
         for curve in (evidence.curve0, evidence.curve1)
-        for k in range(num_curves)
+        for k in (0, 1, toward, away)
     ]
     return torch.stack([*values, known.float()], 1)

@@ -165,7 +165,7 @@ def test_views_of_different_size_are_named() -> None:
 
 
 def test_a_true_disparity_is_kept_more_often_than_a_wrong_one() -> None:
-    from tensor_stereo.evaluation.metrics import match_rates, matches_against_gt
+    from tensor_stereo.evaluation import match_rates, matches_against_gt
 
     dataset = list(SyntheticDataset(3))
     output = run_pipeline([(pair.image0, pair.image1) for pair in dataset])

@@ -117,9 +117,8 @@ def test_the_order_of_the_matches_changes_nothing_but_rounding() -> None:
 
 def test_aligned_matches_lie_on_their_rows() -> None:
     matches = surface(4, 400, 0.0, (-7, 0.02, 0.01), noise_px=0.0)
-    aligned = align_matches(
-        matches, Alignment(torch.tensor([[-7, 0.02, 0.01]], dtype=torch.float64), torch.tensor([True]))
-    )
+    known = Alignment(torch.tensor([[-7, 0.02, 0.01]], dtype=torch.float64), torch.tensor([True]), torch.tensor([400]))
+    aligned = align_matches(matches, known)
     torch.testing.assert_close(aligned.keypoints1[:, 1], matches.keypoints0[:, 1], rtol=0, atol=1e-9)
     assert torch.equal(aligned.keypoints1[:, 0], matches.keypoints1[:, 0])
 
@@ -192,7 +191,7 @@ def test_windows_are_compared_along_the_rows_of_the_alignment() -> None:
             [image],
             matches,
             build_match_graphs(matches),
-            Alignment(torch.tensor([[a, 0, 0]]).double(), fitted),
+            Alignment(torch.tensor([[a, 0, 0]]).double(), fitted, torch.tensor([60])),
         )
         for image, matches, a in ((pair.image1, straight, 0.0), (lowered, lower, 3.0))
     ]

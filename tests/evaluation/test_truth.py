@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from tensor_stereo.batching import collate_matches
 from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.types import Matches
 
@@ -81,3 +83,100 @@ def test_matches_against_gt_names_what_is_wrong() -> None:
         matches_against_gt(matches, torch.zeros(2, 3, 9))
     with pytest.raises(ValueError, match="keypoints0"):
         matches_against_gt(two_matches(0.0, x=30.0), torch.zeros(1, 3, 9))
+
+
+def rectified_pair(seed: int, count: int = 300, noise_px: float = 0.3) -> tuple[Matches, torch.Tensor]:
+    """Matches of a wavy surface with errors of their own in both coordinates, a third of them far off; its truth."""
+    rng = torch.Generator().manual_seed(seed)
+    x = torch.arange(160, dtype=torch.float64)
+    truth = (20 + 8 * torch.sin(x / 30)).expand(120, 160)
+    left = (torch.rand(count, 2, generator=rng, dtype=torch.float64) * torch.tensor([159, 119])).round()
+    disparity = truth[0][left[:, 0].long()]
+    right = left - torch.stack([disparity, torch.zeros_like(disparity)], 1)
+    right += torch.randn(count, 2, generator=rng, dtype=torch.float64) * noise_px
+    right[: count // 3] = torch.rand(count // 3, 2, generator=rng, dtype=torch.float64) * torch.tensor([159, 119])
+    return Matches(left, right, torch.tensor([0, count])), truth[None]
+
+
+def lowered(matches: Matches, a: float, b: float = 0.0, c: float = 0.0) -> Matches:
+    x, y = matches.keypoints0.unbind(1)
+    shift = a + b * x + c * y
+    return replace(matches, keypoints1=matches.keypoints1 + torch.stack([torch.zeros_like(shift), shift], 1))
+
+
+@pytest.mark.parametrize("rows", [-5.0, 1.5, 5.0])
+def test_a_match_on_another_row_is_wrong(rows: float) -> None:
+    matches, truth = rectified_pair(0)
+    correct, _ = matches_against_gt(matches, truth)
+    right = matches.keypoints1.clone()
+    chosen = correct.nonzero()[::7, 0]
+    right[chosen, 1] = matches.keypoints0[chosen, 1] + rows
+    found, valid = matches_against_gt(replace(matches, keypoints1=right), truth)
+    assert valid.all()
+    assert not found[chosen].any()
+    correct[chosen] = False
+    assert torch.equal(found, correct)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("shift", [(8.0, 0.02, 0.0), (-8.0, -0.01, 0.02), (0.6, 0.0, 0.0)])
+def test_what_all_rows_share_is_no_error(seed: int, shift: tuple[float, float, float]) -> None:
+    matches, truth = rectified_pair(seed)
+    correct, _ = matches_against_gt(matches, truth)
+    assert 0.5 < correct.double().mean() < 0.67
+    for max_error_px in (0.5, 1.0, 3.0):
+        expected, _ = matches_against_gt(matches, truth, max_error_px=max_error_px)
+        found, _ = matches_against_gt(lowered(matches, *shift), truth, max_error_px=max_error_px)
+        offset = (matches.keypoints1 - matches.keypoints0)[:, 1].abs()
+        clear = (offset - max_error_px).abs() > 0.15  # the noise of the rows moves the fit a little
+        assert torch.equal(found[clear], expected[clear])
+
+
+def test_fewer_than_twelve_right_disparities_share_no_rows() -> None:
+    matches, truth = rectified_pair(1, 40, noise_px=0.0)
+    right = slice(13, None)
+    for count, expected in ((11, 0), (12, 12)):
+        few = Matches(matches.keypoints0[right][:count], matches.keypoints1[right][:count], torch.tensor([0, count]))
+        assert matches_against_gt(few, truth)[0].all()
+        assert int(matches_against_gt(lowered(few, 5.0), truth)[0].sum()) == expected
+
+
+def test_rows_that_drift_too_much_are_taken_as_they_are() -> None:
+    matches, truth = rectified_pair(2, noise_px=0.0)
+    correct, _ = matches_against_gt(matches, truth)
+    found, _ = matches_against_gt(lowered(matches, 0.0, 0.2), truth)
+    on_their_rows = 0.2 * matches.keypoints0[:, 0] <= 1
+    assert torch.equal(found, correct & on_their_rows)
+    assert 0 < found.sum() < correct.sum()
+
+
+def test_a_row_off_by_just_the_tolerance_is_correct() -> None:
+    left = torch.tensor([[5.1, 1.3], [5.1, 1.3], [5.1, 1.3]])
+    right = left - torch.tensor([[3.0, 1.0], [3.0, -1.0], [3.0, 1.0 + 2**-20]])
+    right[:, 0] = left[:, 0] - 3
+    correct, _ = matches_against_gt(Matches(left, right, torch.tensor([0, 3])), torch.full((1, 4, 9), 3.0))
+    offset = (left[:, 1].double() - right[:, 1].double()).abs()  # of float32 coordinates, exact in float64
+    assert correct.tolist() == (offset <= 1).tolist()
+    whole = torch.tensor([[5.0, 2.0], [5.0, 2.0], [5.0, 2.0]])
+    moved = whole - torch.tensor([[3.0, 1.0], [3.0, -1.0], [3.0, 1.0625]])
+    correct, _ = matches_against_gt(Matches(whole, moved, torch.tensor([0, 3])), torch.full((1, 4, 9), 3.0))
+    assert correct.tolist() == [True, True, False]
+
+
+def test_a_row_that_is_no_number_is_wrong() -> None:
+    matches, truth = rectified_pair(3)
+    expected, _ = matches_against_gt(matches, truth)
+    right = matches.keypoints1.clone()
+    chosen = int(expected.nonzero()[0])
+    right[chosen, 1] = math.nan
+    found, _ = matches_against_gt(replace(matches, keypoints1=right), truth)
+    assert not found[chosen]
+    assert int((found != expected).sum()) <= 2  # the fit has one match fewer
+
+
+def test_a_batch_is_the_loop_over_its_pairs() -> None:
+    pairs = [rectified_pair(seed, 30 + 60 * seed) for seed in range(4)]
+    given = [lowered(matches, 4.0 * k, 0.004 * k) for k, (matches, _) in enumerate(pairs)]
+    batch, _ = matches_against_gt(collate_matches(given), torch.cat([truth for _, truth in pairs]))
+    alone = [matches_against_gt(m, truth)[0] for m, (_, truth) in zip(given, pairs, strict=True)]
+    assert torch.equal(batch, torch.cat(alone))

@@ -124,13 +124,15 @@ def test_a_verdict_of_the_paper_pays_for_no_score_and_shows_one_that_is_asked_fo
     main([*command, "--score", "consensus"])
     table, printed = pl.read_parquet(out), _printed(capsys)
     assert table.select(plain.columns).equals(plain)
-    assert set(table.columns) - set(plain.columns) == {"probability", "inlier_score"}
+    assert set(table.columns) - set(plain.columns) == {"probability", "inlier_score", "domain"}
+    assert table["domain"].unique().to_list() == [""]
+    assert printed["domain"] == "inside"
     assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "untested"))
     assert int(printed["kept_by_score"]) == table["inlier_score"].sum() != int(printed["num_kept"])
     main([*command, "--score", "topology"])  # no probability, so it decides nothing
     table, printed = pl.read_parquet(out), _printed(capsys)
     assert set(table.columns) - set(plain.columns) == {"score"}
-    assert "kept_by_score" not in printed
+    assert not {"kept_by_score", "domain"} & set(printed)
 
 
 def test_the_figure_shows_the_verdict_that_decides_and_beside_a_score_that_of_the_paper(

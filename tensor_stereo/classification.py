@@ -122,6 +122,19 @@ def apply_score(
     return replace(verdict, inlier=keep_by_target(fixed, tested, ptr, **targets)), score
 
 
+def mask_untested(cumulative: Tensor | None, verdict: Classification) -> Tensor | None:
+    """The probabilities of :class:`tensor_stereo.scores.ScoredMatches`, (M, 5) or None, 0 for untested matches.
+
+    >>> left = torch.tensor([[0.0, 0.0], [9.0, 1.0], [1.0, 8.0]])  # a group so small says nothing
+    >>> verdict = classify_matches(Matches(left, left, torch.tensor([0, 3])))
+    >>> mask_untested(torch.ones(3, 5), verdict).any()
+    tensor(False)
+    """
+    if cumulative is None:
+        return None
+    return torch.where((verdict.relation != UNTESTED)[:, None], cumulative, torch.zeros_like(cumulative))
+
+
 def verdicts_by_name(verdict: Classification, score: Tensor | None, config: FilterConfig) -> dict[str, Tensor]:
     """The answers of every verdict to the same matches, to be shown side by side.
 

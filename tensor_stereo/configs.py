@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Literal, NoReturn, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from tensor_stereo.limits import Count, Fraction, NotNegative, OddPx, Positive, Within, check_settings
 
@@ -27,13 +27,8 @@ LEAST_ERROR_PX, MOST_ERROR_PX = 0.5, 5.0  # tolerances between which a score is 
 COLDEST, HOTTEST = 1e-9, 1e9  # temperatures whose gradients are finite in float32 too
 
 
-def __getattr__(name: str) -> NoReturn:
-    if name == "ClassifyConfig":
-        raise ImportError("ClassifyConfig is FilterConfig now, and its restriction is verdict")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
 Ratio = Annotated[float, Within(0, 1, open_low=True)]
+Tolerance = Annotated[float, Within(LEAST_ERROR_PX, MOST_ERROR_PX)]
 
 
 @dataclass(frozen=True)
@@ -159,7 +154,8 @@ class FilterConfig:
 
     A probability of at least .5 keeps a match under the verdict ``score``, unless one of ``threshold``,
     ``target_sensitivity`` and ``min_precision`` says otherwise. The score ``topology`` is a similarity, not a
-    probability, and needs an explicit ``threshold``.
+    probability, and needs an explicit ``threshold``. A match is correct, and a probability is that of it, if its error
+    is at most ``max_error_px``, in px of view 0.
 
     ``auto`` stands for ``learned`` under the verdict ``score`` (for ``consensus`` where its settings say that the pairs
     are not rectified), and for no score under the verdicts of the paper, so that nobody pays for what is not asked. In
@@ -175,6 +171,7 @@ class FilterConfig:
     threshold: Fraction | None = None  # least score of a match that is kept
     target_sensitivity: Fraction | None = None  # fraction of the incorrect matches that are rejected, at least
     min_precision: Fraction | None = None  # fraction of the kept matches that are correct, at least
+    max_error_px: Tolerance = 1.0  # a match is correct iff its error is at most that; a score is the probability of it
     min_group_size: Annotated[int, Within(1, 2**31 - 1)] = 4  # distinct matches below which a group says nothing
     tie_tolerance: Annotated[float, Within(0, 1, open_high=True)] = 1e-3  # in edge lengths
     temperature: Annotated[float, Within(COLDEST, HOTTEST)] = 1.0  # of the score topology
@@ -267,22 +264,26 @@ class FileFilterConfig(FilterConfig):
 def describe_verdict(settings: Mapping[str, Any]) -> str:
     """What decides under some settings, in a few words; ``score`` is a resolved one.
 
+    A tolerance of 1 px, and that of a score that is no probability, goes without saying.
+
     >>> describe_verdict({"verdict": "adjacency"}), describe_verdict({"verdict": "score", "score": "learned"})
     ('adjacency', 'learned, probability 0.5')
     """
     if settings["verdict"] != "score":
         return str(settings["verdict"])
+    max_error_px = settings.get("max_error_px", 1)
+    within = f" within {max_error_px:g} px" if max_error_px != 1 and settings["score"] != "topology" else ""
     for name in CUTS:
         if settings.get(name) is not None:
-            return f"{settings['score']}, {name.replace('_', ' ')} {settings[name]:g}"
-    return f"{settings['score']}, probability {LIKELY:g}"
+            return f"{settings['score']}, {name.replace('_', ' ')} {settings[name]:g}{within}"
+    return f"{settings['score']}, probability {LIKELY:g}{within}"
 
 
 def describe_settings(config: FilterConfig) -> str:
     """What decides under some settings, in a few words, as :func:`describe_verdict` says it of a row of results.
 
-    >>> describe_settings(FilterConfig(min_precision=0.9))
-    'learned, min precision 0.9'
+    >>> describe_settings(FilterConfig(min_precision=0.9, max_error_px=3))
+    'learned, min precision 0.9 within 3 px'
     """
     return describe_verdict(vars(config) | {"score": config.resolved_score})
 
@@ -325,7 +326,6 @@ class TrialConfig(PipelineConfig):
     outlier_rate: Fraction = 0.0  # of the matches whose partners in view 1 change places among them
     noise_px: NotNegative = 0.0  # standard deviation added to x and y of both keypoints
     seed: Annotated[int, Within(0, 2**31 - 1)] = 0  # of outliers and noise, together with the name of the pair
-    max_error_px: Positive = 1.0  # a match is correct iff its disparity is off by no more
 
 
 @dataclass(frozen=True)
@@ -347,7 +347,6 @@ class EvaluationConfig(StepConfigs):
 
     min_group_size: Annotated[int, Within(1, 2**31 - 1)] = 1  # 1: the paper read literally
     detectors: tuple[Detector, ...] = DETECTORS
-    max_error_px: Positive = 1.0  # a match is correct iff its disparity is off by no more
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -367,7 +366,7 @@ class EvaluationConfig(StepConfigs):
         last with Restriction 3.
         """
         shared = {f.name: getattr(self, f.name) for f in fields(StepConfigs)}
-        trial = TrialConfig(**shared, detector=detector, max_error_px=self.max_error_px)
+        trial = TrialConfig(**shared, detector=detector)
         trials = []
         if trial.verdict == "score":
             trials.append(trial)

@@ -12,14 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded, lengths_to_ptr, select_matches
-from tensor_stereo.classification import apply_score, classify_graphs
+from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
 from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FileFilterConfig, FilterConfig
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores.alignment import Alignment, estimate_alignment
-from tensor_stereo.scores.by_name import is_aligned, score_matches
+from tensor_stereo.scores.alignment import Alignment
+from tensor_stereo.scores.by_name import score_matches
 from tensor_stereo.scores.image_evidence import ImageEvidence
 from tensor_stereo.scores.learned import LearnedScore, load_learned
+from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
 
 Images = Tensor | Sequence[Tensor]
@@ -35,13 +36,17 @@ class FilterOutput:
     Attributes:
         inlier: bool; False for untested matches and in the padding.
         score: in [0, 1], higher is better; 0 for untested matches and in the padding. ``consensus`` and ``learned`` are
-            the calibrated probability of an error of at most 1 px, ``topology`` is a similarity. None if the settings
-            ask for none.
+            the calibrated probability of an error of at most ``max_error_px``, ``topology`` is a similarity. None if
+            the settings ask for none.
         relation: int8 values of :class:`Relation`, UNTESTED in the padding.
         matches: the M real matches of the input, as one ragged batch.
         mask: bool, the places of ``matches`` in the layout; None for ragged input.
         alignment: Row offset and row drift of each of the B rectified pairs, which the score has taken out, and whether
             enough matches agree on them; None where the score takes none out.
+        cumulative: One axis more: probabilities of an error of at most each of
+            :data:`tensor_stereo.scores.TOLERANCES_PX`, 0 where the score is; None where that is no probability.
+        domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
+            probability was calibrated on, 0 inside; None where there is no probability.
     """
 
     inlier: Tensor
@@ -50,6 +55,31 @@ class FilterOutput:
     matches: Matches
     mask: Tensor | None = None
     alignment: Alignment | None = None
+    cumulative: Tensor | None = None
+    domain: Tensor | None = None
+
+    def probability(self, max_error_px: float) -> Tensor:
+        """The calibrated probability of an error of at most ``max_error_px``, without another pass.
+
+        At the tolerance of the settings it is ``score``, bit for bit, but without ``straight_through``.
+
+        Args:
+            max_error_px: From .5 to 5 px of view 0.
+
+        Returns:
+            In the layout and the dtype of ``score``, 0 where that is 0. It never falls when the tolerance grows.
+            Gradients flow as from ``score``.
+
+        Raises:
+            ValueError: for another tolerance, or where the score is no probability.
+
+        >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
+        >>> output = DelaunayFilter()(left, left - torch.tensor([2.0, 0.0]))
+        >>> torch.equal(output.probability(1), output.score)
+        True
+        """
+        found = probability_within(self.cumulative, max_error_px)
+        return found if self.score is None else found.to(self.score.dtype)
 
     def to_matches(self) -> Matches:
         """The inliers, for the next filter. All pairs stay, some possibly empty; gradients flow to the keypoints."""
@@ -84,6 +114,7 @@ class DelaunayFilter(nn.Module):
             least this value (precision is the paper's negative predictive value).
             ``target_sensitivity``: The verdict keeps the largest set of matches of a pair that is expected to leave out
             this fraction of the incorrect ones.
+            ``max_error_px``: The score is the probability of an error of at most this, from .5 to 5 px of view 0.
             ``min_group_size``, ``tie_tolerance``, ``backend``: As in :func:`tensor_stereo.classify_matches`.
             ``consensus``: Settings of that score; ``UNRECTIFIED`` is for pairs that are not rectified.
             ``temperature``: Of ``topology``; dual Voronoi edges much shorter than this are hardly told from ties.
@@ -95,8 +126,9 @@ class DelaunayFilter(nn.Module):
         ValueError: for a value outside of its limits, or settings that contradict each other.
 
     The state dictionary holds the weights and a fingerprint of the settings that define the score; the state of another
-    score is refused. ``torch.compile(fullgraph=True)`` works, for ``learned`` with batches that have at least one pair
-    of neighbours, and without images: to use these, measure the evidence outside of the compiled part.
+    score is refused, but not that of another tolerance, which has the same weights. ``torch.compile(fullgraph=True)``
+    works, for ``learned`` with batches that have at least one pair of neighbours, and without images: to use these,
+    measure the evidence outside of the compiled part. Compiled, it marks pairs outside of the domain without a warning.
 
     Source: the set tests are those of Bustos, Vargas & Trujillo, CIARP 2016, section 3; the scores are this library's.
 
@@ -226,9 +258,10 @@ class DelaunayFilter(nn.Module):
                 ``Matches``, in place of the images.
 
         Returns:
-            ``inlier``, ``score`` and ``relation`` in the layout of the input. The score has the dtype of the keypoints,
-            under autocast that of autocast. Gradients flow from it to both keypoints (and the temperature, and for
-            consensus the cost), and are zero for untested matches; topology is not differentiable twice.
+            ``inlier``, ``score``, ``relation`` and ``cumulative`` in the layout of the input. The score has the dtype
+            of the keypoints, under autocast that of autocast. Gradients flow from it to both keypoints (and the
+            temperature, and for consensus the cost), and are zero for untested matches; topology is not differentiable
+            twice.
 
         Raises:
             ValueError: if shapes disagree, coordinates are NaN, infinite or out of range, or costs are NaN.
@@ -236,7 +269,8 @@ class DelaunayFilter(nn.Module):
                 beside a score that looks at none.
 
         Warns:
-            DomainWarning: if the keypoints are no pixels of rectified pairs, as ``learned`` and ``consensus`` expect.
+            DomainWarning: if the keypoints are no pixels of rectified pairs whose matches agree, as ``learned`` and
+                ``consensus`` expect.
         """
         if isinstance(keypoints0, Matches):
             rest = {"keypoints1": keypoints1, "mask": mask, "group": group, "cost": cost}
@@ -259,13 +293,13 @@ class DelaunayFilter(nn.Module):
         ptr = lengths_to_ptr(mask.sum(1))
         matches = Matches(rows["keypoints0"], rows["keypoints1"], ptr, rows["cost"], rows["group"])  # type: ignore[arg-type]
         output = self._decide(matches, images0, images1, None)
-        inlier, score, relation = (
-            None if values is None else _spread(values, mask)
-            for values in (output.inlier, output.score, output.relation)
-        )
+        spread: dict[str, Any] = {"mask": mask}
+        for name in ("inlier", "score", "relation", "cumulative"):
+            values: Tensor | None = getattr(output, name)
+            spread[name] = None if values is None else _spread(values, mask)
         if single:
-            inlier, score, relation, mask = (None if v is None else v[0] for v in (inlier, score, relation, mask))
-        return FilterOutput(inlier, score, relation, matches, mask, output.alignment)  # type: ignore[arg-type]
+            spread = {name: None if values is None else values[0] for name, values in spread.items()}
+        return FilterOutput(matches=matches, alignment=output.alignment, domain=output.domain, **spread)
 
     def _decide(
         self, matches: Matches, images0: Images | None, images1: Images | None, evidence: ImageEvidence | None
@@ -277,32 +311,23 @@ class DelaunayFilter(nn.Module):
             for name, value in (("images0", images), ("evidence", evidence)):
                 if value is not None:
                     raise TypeError(f"{name} must be None where there is no score")
-        graphs = alignment = None
-        if config.resolved_score != "topology":
             graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
-        if graphs is not None and config.resolved_score == "none":
             verdict = classify_graphs(graphs, config)
             return FilterOutput(verdict.inlier, None, verdict.relation, matches)
-        if graphs is not None and is_aligned(config):
-            alignment = estimate_alignment(matches, graphs)
-        score, graphs = score_matches(
-            matches,
-            config,
-            graphs,
-            images=images,
-            evidence=evidence,
-            alignment=alignment,
-            temperature=self.temperature,
-            network=self.network,
+        found = score_matches(
+            matches, config, images=images, evidence=evidence, temperature=self.temperature, network=self.network
         )
-        score = score.to(matches.keypoints0.dtype)
-        verdict, score = apply_score(classify_graphs(graphs, config), score, matches.ptr, config)
+        score = found.score.to(matches.keypoints0.dtype)
+        verdict, score = apply_score(classify_graphs(found.graphs, config), score, matches.ptr, config)
         device = matches.keypoints0.device.type
         if torch.is_autocast_enabled(device):  # after the verdict, which no rounding shall change
             score = score.to(torch.get_autocast_dtype(device))
         if self.straight_through:
             score = score + (verdict.inlier.to(score.dtype) - score).detach()
-        return FilterOutput(verdict.inlier, score, verdict.relation, matches, alignment=alignment)
+        cumulative = mask_untested(found.cumulative, verdict)
+        return FilterOutput(
+            verdict.inlier, score, verdict.relation, matches, None, found.alignment, cumulative, found.domain
+        )
 
 
 def _refuse_other_score(module: DelaunayFilter, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
@@ -358,5 +383,6 @@ def _check_padded(tensors: dict[str, Tensor | None], *, single: bool) -> Tensor:
 
 
 def _spread(rows: Tensor, mask: Tensor) -> Tensor:
-    """(M,) rows -> (B, N), zero in the padding."""
+    """(M, ...) rows -> (B, N, ...), zero in the padding."""
+    mask = mask.reshape(mask.shape + (1,) * (rows.ndim - 1)).expand(mask.shape + rows.shape[1:])
     return torch.zeros_like(mask, dtype=rows.dtype).masked_scatter(mask, rows)

@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
-from tensor_stereo.classification import apply_score, classify_graphs
+from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
-from tensor_stereo.scores.by_name import score_matches
+from tensor_stereo.scores.alignment import Alignment
+from tensor_stereo.scores.by_name import ScoredMatches, score_matches
+from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Classification, Features, Matches
 
 ImagePair = tuple[Tensor, Tensor]
@@ -48,8 +50,13 @@ class PipelineOutput:
         graphs: their Delaunay graphs.
         classification: one verdict per match.
         score: (M,), higher is better, 0 for untested matches; None if the settings ask for none. ``learned``, the
-            default, and ``consensus`` are the calibrated probability of an error of at most 1 px.
+            default, and ``consensus`` are the calibrated probability of an error of at most ``max_error_px``.
         seconds: wall time of each stage for the whole batch.
+        cumulative: (M, 5) probabilities of an error of at most each of :data:`tensor_stereo.scores.TOLERANCES_PX`, 0
+            for untested matches; None where the score is no probability.
+        alignment: Row offset and row drift of each pair, which the score has taken out; None where it takes none out.
+        domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
+            probability was calibrated on, 0 inside; None where there is no probability.
     """
 
     matches: Matches
@@ -57,6 +64,20 @@ class PipelineOutput:
     classification: Classification
     score: Tensor | None
     seconds: dict[str, float]
+    cumulative: Tensor | None = None
+    alignment: Alignment | None = None
+    domain: Tensor | None = None
+
+    def probability(self, max_error_px: float) -> Tensor:
+        """(M,) calibrated probability of an error of at most ``max_error_px``, from .5 to 5 px, without another run.
+
+        At the tolerance of the settings it is ``score``, bit for bit; it never falls when the tolerance grows.
+
+        Raises:
+            ValueError: for another tolerance, or where the score is no probability.
+        """
+        found = probability_within(self.cumulative, max_error_px)
+        return found if self.score is None else found.to(self.score.dtype)
 
 
 def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineConfig()) -> PipelineOutput:
@@ -91,10 +112,12 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
     with watch.measure("relate"):
         verdicts = classify_graphs(graphs, config)
     with watch.measure("score"):
-        score = score_pairs(gray, matches, graphs, config)
-        if score is not None:
-            verdicts, score = apply_score(verdicts, score, matches.ptr, config)
-    return PipelineOutput(matches, graphs, verdicts, score, watch.seconds)
+        found = score_pairs(gray, matches, graphs, config)
+        if found is None:
+            return PipelineOutput(matches, graphs, verdicts, None, watch.seconds)
+        verdicts, score = apply_score(verdicts, found.score, matches.ptr, config)
+        cumulative = mask_untested(found.cumulative, verdicts)
+    return PipelineOutput(matches, graphs, verdicts, score, watch.seconds, cumulative, found.alignment, found.domain)
 
 
 def to_gray_pairs(pairs: Sequence[ImagePair]) -> list[ImagePair]:
@@ -149,7 +172,7 @@ def group_pairs(gray: Sequence[ImagePair], matches: Matches, config: PipelineCon
 @torch.no_grad()
 def score_pairs(
     gray: Sequence[ImagePair], matches: Matches, graphs: MatchGraphs, config: PipelineConfig
-) -> Tensor | None:
+) -> ScoredMatches | None:
     """The score that the settings name of every match, in the dtype of the keypoints, also of untested ones.
 
     Args:
@@ -162,5 +185,5 @@ def score_pairs(
         return None
     images0, images1 = ([pair[view][0] for pair in gray] for view in (0, 1))
     images = (images0, images1) if config.resolved_score == "learned" else None
-    score, _ = score_matches(matches, config, graphs, images=images)
-    return score.to(matches.keypoints0.dtype)
+    found = score_matches(matches, config, graphs, images=images)
+    return found._replace(score=found.score.to(matches.keypoints0.dtype))

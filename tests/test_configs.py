@@ -170,8 +170,6 @@ def test_auto_stands_for_the_best_score_that_is_asked_for() -> None:
 
 
 def test_old_names_fail_with_the_new_one() -> None:
-    with pytest.raises(ImportError, match="ClassifyConfig is FilterConfig now, and its restriction is verdict"):
-        from tensor_stereo.configs import ClassifyConfig  # noqa: F401
     with pytest.raises(TypeError, match="has no setting 'restriction'; it is 'verdict' now"):
         ts.DelaunayFilter(restriction="adjacency")
     with pytest.raises(TypeError, match="has no setting 'unit'; it is 'temperature_unit' now"):

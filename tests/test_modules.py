@@ -244,22 +244,26 @@ def _compare_compiled(backend: str, settings: dict[str, object]) -> None:
     torch.compiler.reset()
     module = ts.DelaunayFilter(**settings)  # type: ignore[arg-type]
 
-    def loss(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def loss(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, ...]:
         output = module(left, right)
-        return output.score.square().sum(), output.inlier, output.relation
+        value = output.score.square().sum()
+        if output.cumulative is not None:
+            value = value + output.probability(2.5).sum()
+        return value, output.inlier, output.relation, output.relation if output.domain is None else output.domain
 
     results = []
     for function in (loss, torch.compile(loss, fullgraph=True, backend=backend)):
         left, right = _padded(num_rows=30)
         right.requires_grad_()
-        value, inlier, relation = function(left, right)
+        value, inlier, relation, domain = function(left, right)
         value.backward()
-        results.append((value, inlier, relation, right.grad))
-    (value, inlier, relation, gradient), compiled = results
+        results.append((value, inlier, relation, right.grad, domain))
+    (value, inlier, relation, gradient, domain), compiled = results
     assert torch.allclose(value, compiled[0], rtol=1e-6)
     assert torch.equal(inlier, compiled[1])
     assert torch.equal(relation, compiled[2])
     assert torch.allclose(gradient, compiled[3], rtol=1e-5, atol=1e-7)
+    assert torch.equal(domain, compiled[4])
 
 
 @pytest.mark.gpu

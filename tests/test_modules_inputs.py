@@ -208,7 +208,7 @@ def test_weights_of_learned_are_parameters_that_survive_and_can_be_trained() -> 
 
 def test_repr_shows_the_settings() -> None:
     text = repr(ts.DelaunayFilter(min_precision=0.9))
-    assert "verdict='score', score='learned', min_precision=0.9, min_group_size=4" in text
+    assert "verdict='score', score='learned', min_precision=0.9, max_error_px=1.0, min_group_size=4" in text
     text = repr(ts.DelaunayFilter(verdict="adjacency", temperature=0.5))
     assert "verdict='adjacency', score='topology'" in text
     assert "temperature=0.5" in text
@@ -296,6 +296,7 @@ def test_a_refused_state_changes_nothing() -> None:
         module.load_state_dict(state)
 
 
+@pytest.mark.filterwarnings("ignore:the score expects matches that agree")  # colours that match badly
 def test_a_grey_view_may_stand_beside_one_in_colour() -> None:
     """As if its channel had been repeated, in the pipeline and in the module."""
     matches, image0, image1 = rendered(2)

@@ -13,6 +13,7 @@ from tensor_stereo.datasets import PairDataset, find_pairs
 from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
 from tensor_stereo.ops import backends
 from tensor_stereo.pipeline import ImagePair, run_pipeline
+from tensor_stereo.scores.domain import Domain, DomainWarning
 from tensor_stereo.types import Relation
 from tests.oracles import installed_backends, neighbor_sets, relation_of_sets
 
@@ -165,10 +166,34 @@ def test_views_of_different_size_are_named() -> None:
 
 
 def test_a_true_disparity_is_kept_more_often_than_a_wrong_one() -> None:
-    from tensor_stereo.evaluation.metrics import match_rates, matches_against_gt
+    from tensor_stereo.evaluation import match_rates, matches_against_gt
 
     dataset = list(SyntheticDataset(3))
     output = run_pipeline([(pair.image0, pair.image1) for pair in dataset])
     truth = matches_against_gt(output.matches, [pair.disparity_gt for pair in dataset])  # type: ignore[misc]
     rates = match_rates(output.classification.inlier, *truth)
     assert rates.sensitivity + rates.specificity > 1.8  # 1 is a coin toss, 2 is the truth
+
+
+@pytest.mark.parametrize("score", ["learned", "consensus"])
+def test_one_run_gives_the_probability_at_every_tolerance(score: Score) -> None:
+    pairs = [(pair.image0, pair.image1) for pair in SyntheticDataset(2)]
+    output = run_pipeline(pairs, PipelineConfig(score=score))
+    assert output.cumulative.shape == (output.matches.num_matches, 5)
+    assert output.alignment.fitted.tolist() == [True, True]
+    assert output.domain.tolist() == [0, 0]
+    assert torch.equal(output.probability(1), output.score)
+    wide = run_pipeline(pairs, PipelineConfig(score=score, max_error_px=2.5))
+    assert torch.equal(output.probability(2.5), wide.score)
+    assert (output.probability(5) >= output.score).all()
+
+
+def test_a_pair_of_two_scenes_is_marked() -> None:
+    one, other = SyntheticDataset(2)
+    with pytest.warns(DomainWarning, match="those of pair 1 hardly do"):
+        output = run_pipeline([(one.image0, one.image1), (one.image0, other.image1)])
+    assert output.domain.tolist() == [0, Domain.AGREEMENT]
+    plain = run_pipeline([(one.image0, other.image1)], PipelineConfig(verdict="cardinality"))
+    assert plain.domain is plain.cumulative is plain.alignment is None
+    with pytest.raises(ValueError, match="score must be 'learned' or 'consensus'"):
+        plain.probability(1.0)

@@ -6,13 +6,20 @@ import numpy as np
 import torch
 
 import tensor_stereo as ts
-from accuracy.putatives import Putatives, to_images, to_matches
+from accuracy.putatives import MAX_ERROR_PX, Putatives, to_images, to_matches
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
 from tensor_stereo.classification import classify_graphs
 from tensor_stereo.evaluation import match_rates
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores import calibrate_consensus, consensus_belief, keep_by_target, load_learned, measure_images
+from tensor_stereo.scores import (
+    calibrate_consensus,
+    consensus_belief,
+    keep_by_target,
+    load_learned,
+    measure_images,
+    probability_within,
+)
 
 TARGETS = ({"target_sensitivity": 0.9}, {"target_sensitivity": 0.96}, {"min_precision": 0.9}, {"min_precision": 0.95})
 
@@ -26,10 +33,10 @@ def find_probabilities(found: list[Putatives]) -> tuple[ts.Matches, torch.Tensor
     plain, shown = network(matches, graphs), network(matches, graphs, evidence)
     probabilities = {
         "consensus + cost, raw": belief,
-        "consensus + cost": calibrate_consensus(belief),
-        "learned, no images": plain[1],
-        "learned, raw": torch.sigmoid(shown[0]),
-        "learned": shown[1],
+        "consensus + cost": probability_within(calibrate_consensus(belief), MAX_ERROR_PX),
+        "learned, no images": probability_within(plain[1], MAX_ERROR_PX),
+        "learned, raw": probability_within(torch.sigmoid(shown[0]), MAX_ERROR_PX),
+        "learned": probability_within(shown[1], MAX_ERROR_PX),
     }
     return matches, classify_graphs(graphs).relation != 0, probabilities
 

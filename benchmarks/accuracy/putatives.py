@@ -48,7 +48,7 @@ class Putatives:
         cost: (M,) SSD; NaN for matches that were made up.
         ratio: (M,) distance over that of the second-best candidate; NaN without one.
         valid: (M,) ground truth is known.
-        correct: (M,) the disparity is off by at most :data:`MAX_ERROR_PX`.
+        correct: (M,) disparity and row are off by at most :data:`MAX_ERROR_PX`.
         views: grey images (H, W) of both views.
     """
 

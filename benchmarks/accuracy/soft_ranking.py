@@ -10,7 +10,8 @@ import torch
 
 import tensor_stereo as ts
 from tensor_stereo.configs import MatchingConfig, PipelineConfig
-from tensor_stereo.evaluation.metrics import matches_against_gt, roc_auc, specificity_at_sensitivity
+from tensor_stereo.evaluation import matches_against_gt, roc_auc
+from tensor_stereo.evaluation.metrics import specificity_at_sensitivity
 from tensor_stereo.pipeline import Stopwatch, match_pairs, to_gray_pairs
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages

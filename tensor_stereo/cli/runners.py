@@ -187,10 +187,12 @@ def _run_classify(command: Classify) -> int:
     )
     values = asdict(summary)
     rates = values.pop("rates") or {}
-    num_agreeing = values.pop("num_agreeing")
+    num_agreeing, domain = values.pop("num_agreeing"), values.pop("domain")
     kept_by = {f"kept_by_{name}": count for name, count in values.pop("kept_by").items()}
     for name, value in (values | kept_by | rates).items():
         print(f"{name:20}{value:8.2f}" if isinstance(value, float) else f"{name:20}{value:8}")
+    if domain is not None:
+        print(f"{'domain':20}{domain or 'inside':>8}")
     if summary.rates is not None and summary.rates.fraction_incorrect != summary.rates.fraction_incorrect:
         return fail(f"no match has known ground truth in {command.disparity_gt}, so there are no rates")
     return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from tensor_stereo.evaluation.metrics import Rates as Rates
     from tensor_stereo.evaluation.metrics import ScoreCounts as ScoreCounts
     from tensor_stereo.evaluation.metrics import match_rates as match_rates
-    from tensor_stereo.evaluation.metrics import matches_against_gt as matches_against_gt
     from tensor_stereo.evaluation.metrics import roc_auc as roc_auc
     from tensor_stereo.evaluation.metrics import roc_curve as roc_curve
     from tensor_stereo.evaluation.perturbation import add_noise as add_noise
     from tensor_stereo.evaluation.perturbation import inject_outliers as inject_outliers
     from tensor_stereo.evaluation.trials import Trial as Trial
     from tensor_stereo.evaluation.trials import TrialRunner as TrialRunner
+    from tensor_stereo.evaluation.truth import matches_against_gt as matches_against_gt
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
@@ -41,7 +41,7 @@ __getattr__, __dir__, __all__ = attach(
         "evaluate_pair": "dataset",
         "inject_outliers": "perturbation",
         "match_rates": "metrics",
-        "matches_against_gt": "metrics",
+        "matches_against_gt": "truth",
         "roc_auc": "metrics",
         "roc_curve": "metrics",
         "score_dataset": "dataset",

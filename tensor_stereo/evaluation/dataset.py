@@ -45,6 +45,7 @@ ROW_SCHEMA: dict[str, Any] = {
     "threshold": pl.Float64,  # one of these three at most, under the verdict score
     "target_sensitivity": pl.Float64,
     "min_precision": pl.Float64,
+    "max_error_px": pl.Float64,  # of a correct match; the score is the probability of it
     "num_matches": pl.Int64,
     "num_valid": pl.Int64,  # ground truth is known
     "num_untested": pl.Int64,  # among all matches
@@ -63,6 +64,7 @@ ROW_SCHEMA: dict[str, Any] = {
     "specificity_at_sensitivity_96": pl.Float64,
     "score_counts_correct": pl.List(pl.Int64),  # 128 equal bins of [0, 1]; they add up over pairs
     "score_counts_incorrect": pl.List(pl.Int64),
+    "domain": pl.String,  # why the score may be far off, empty if it may not; null where it is no probability
     "seconds": pl.Struct(dict.fromkeys(STAGES, pl.Float64)),  # wall time by stage, also where it was shared
 }
 

@@ -1,66 +1,21 @@
 """How good verdicts and scores are, against ground truth.
 
-**Positive means estimated incorrectly**: a match is positive if its disparity is wrong, and predicted positive if it is
+**Positive means estimated incorrectly**: a match is positive if it is wrong, and predicted positive if it is
 rejected. Every figure comes from integer counts that add up exactly, so parts merged give what the whole gives.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from operator import add
 
 import torch
 from torch import Tensor
 
-from tensor_stereo.sampling import sample_nearest
-from tensor_stereo.types import Matches, check_mask, check_vector
+from tensor_stereo.types import check_mask, check_vector
 
 PAPER_SENSITIVITY, PAPER_SPECIFICITY = 0.96, 0.70  # Bustos, Vargas & Trujillo, CIARP 2016, in words
-
-
-def matches_against_gt(
-    matches: Matches, disparity_gt: Tensor | Sequence[Tensor], *, max_error_px: float = 1.0
-) -> tuple[Tensor, Tensor]:
-    """Compare the disparity of every match with ground truth at the nearest pixel of its left keypoint.
-
-    Coordinates are rounded half to even; keypoints up to 1 px outside the image read the border. No gradient.
-
-    Args:
-        matches: M matches of B pairs.
-        disparity_gt: (B, H, W) floating point, or B maps (H_b, W_b) where sizes differ; x0 - x1 in px of view 0. NaN
-            and infinite values are unknown; 0 is a disparity.
-        max_error_px: largest error of a correct match.
-
-    Returns:
-        correct (M,) bool, False where ground truth is unknown, and valid (M,) bool, True where it is known.
-
-    Raises:
-        ValueError: if there is not one map per pair, ``max_error_px`` is negative, or a keypoint lies more than 1 px
-            outside its image.
-        TypeError: if a map does not hold floating point values.
-
-    Source: the paper, section 4.
-
-    Example:
-        >>> left, right = torch.tensor([[5.0, 0.0], [6.0, 0.0]]), torch.tensor([[2.0, 0.0], [1.0, 0.0]])
-        >>> matches = Matches(left, right, ptr=torch.tensor([0, 2]))
-        >>> matches_against_gt(matches, torch.full((1, 4, 8), 3.0))
-        (tensor([ True, False]), tensor([True, True]))
-    """
-    if not max_error_px >= 0:
-        raise ValueError(f"max_error_px must not be negative, got {max_error_px}")
-    for b, disparity in enumerate(disparity_gt):
-        if not disparity.is_floating_point():
-            raise TypeError(
-                f"disparity_gt of pair {b} must be floating point with NaN for unknown, got {disparity.dtype}"
-            )
-    truth = sample_nearest(disparity_gt, matches.keypoints0, matches.ptr, name="keypoints0")
-    valid = truth.isfinite()
-    # the difference of two float32 coordinates is exact in float64, so an error of just 1 px stays one
-    estimate = matches.keypoints0[:, 0].double() - matches.keypoints1[:, 0].double()
-    return valid & ((truth - estimate).abs() <= max_error_px), valid
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,15 @@ from torch import Tensor
 
 from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import CUTS, TrialConfig
-from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, matches_against_gt, roc_update
+from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, roc_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
+from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.pipeline import STAGES as PIPELINE_STAGES
 from tensor_stereo.pipeline import Stopwatch, detect_pairs, score_pairs, to_gray_pairs
+from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
 STAGES = (*PIPELINE_STAGES[:2], "perturb", *PIPELINE_STAGES[2:])
@@ -35,11 +37,13 @@ class Trial:
         pair: the images and their ground truth.
         config: the setting.
         matches: the putative matches, exchanged and moved as the setting says, with ``group`` if constrained.
-        correct: (M,) bool, the disparity is right.
+        correct: (M,) bool, disparity and row are right within ``max_error_px``.
         valid: (M,) bool, ground truth is known; all False for a pair without.
         graphs: the Delaunay graphs of both views.
         classification: the set tests; ``inlier`` follows the verdict that the setting names.
         score: (M,), higher is better; None if the setting asks for none.
+        domain: Why the pair lies outside of what the probability was calibrated on, a value of
+            :class:`tensor_stereo.scores.Domain`, 0 inside; None where there is no probability.
         seconds: wall time of each of ``STAGES``, also where it was shared with other trials.
     """
 
@@ -51,6 +55,7 @@ class Trial:
     graphs: MatchGraphs
     classification: Classification
     score: Tensor | None
+    domain: int | None
     seconds: dict[str, float]
 
     def row(self) -> dict[str, Any]:
@@ -77,6 +82,7 @@ class Trial:
             "precision": rates.precision,
             "recall": rates.recall,
             **self._score_row(),
+            "domain": None if self.domain is None else describe_domain(self.domain),
             "seconds": self.seconds,
         }
 
@@ -129,6 +135,7 @@ def setting_columns(config: TrialConfig) -> dict[str, Any]:
             for name, value in vars(config.consensus).items()
         },
         **{name: getattr(config, name) for name in CUTS},
+        "max_error_px": config.max_error_px,
     }
 
 
@@ -145,7 +152,8 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
         features = replace(features, max_ratio=None)  # a setting of the matcher
     keys: dict[str, Hashable] = {"detect": (trial.detector, features)}
     keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
-    keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed, trial.max_error_px
+    keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed
+    keys["truth"] = keys["perturb"], trial.max_error_px
     if trial.constrained:
         keys["label"] = trial.objects  # of the images alone
     keys["group"] = keys["perturb"], trial.objects if trial.constrained else None
@@ -208,7 +216,9 @@ class TrialRunner:
 
         features = share("detect", lambda: detect_pairs(self._gray, trial))
         putative = share("match", lambda: match_features(*features, trial))
-        matches, correct, valid = share("perturb", lambda: self._perturb(putative, trial))
+        matches = share("perturb", lambda: self._perturb(putative, trial))
+        correct, valid = share("truth", lambda: self._judge(matches, trial))
+        seconds["perturb"] += seconds.pop("truth")
         if trial.constrained:
             labels = share("label", lambda: [label_objects(image, trial.objects) for image in self._gray[0]])
             matches = share("group", lambda: replace(matches, group=group_matches(matches, *labels)))
@@ -221,15 +231,17 @@ class TrialRunner:
             "relate",
             lambda: classify_graphs(graphs, trial),
         )
-        score = None
+        score = domain = found = None
         if trial.resolved_score != "none":
-            score = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
-        if score is not None:
+            found = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
+        if found is not None:
+            score = found.within(trial.max_error_px).to(found.score.dtype)  # it may be that of another tolerance
             verdict, score = apply_score(verdict, score, matches.ptr, trial)
-        return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, seconds)
+            domain = None if found.domain is None else int(found.domain)
+        return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, domain, seconds)
 
-    def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor, Tensor]:
-        """The matches as the setting wants them, and what ground truth says of them."""
+    def _perturb(self, matches: Matches, trial: TrialConfig) -> Matches:
+        """The matches as the setting wants them."""
         name = f"{trial.seed}/{self.pair.dataset}/{scene_name(self.pair)}"
         seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") >> 1
         generator = torch.Generator().manual_seed(seed)
@@ -238,10 +250,14 @@ class TrialRunner:
         if trial.noise_px:
             height, width = self.pair.image0.shape[1:]
             matches = add_noise(matches, trial.noise_px, generator, [(height, width)])
+        return matches
+
+    def _judge(self, matches: Matches, trial: TrialConfig) -> tuple[Tensor, Tensor]:
+        """Which matches are correct by ground truth, and of which it is known."""
         if self.pair.disparity_gt is None:
             unknown = torch.zeros(matches.num_matches, dtype=torch.bool)
-            return matches, unknown, unknown
-        return matches, *matches_against_gt(matches, [self.pair.disparity_gt], max_error_px=trial.max_error_px)
+            return unknown, unknown
+        return matches_against_gt(matches, [self.pair.disparity_gt], max_error_px=trial.max_error_px)
 
 
 def scene_name(pair: StereoPair) -> str:

@@ -15,12 +15,14 @@ from tensor_stereo.configs import PipelineConfig, describe_settings
 from tensor_stereo.datasets import PairFiles, read_pair
 from tensor_stereo.datasets.discovery import find_scale
 from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
-from tensor_stereo.evaluation.metrics import Rates, match_rates, matches_against_gt
+from tensor_stereo.evaluation.metrics import Rates, match_rates
+from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
 from tensor_stereo.paths import TABLES, check_apart, has_ending, prepare_target
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
+from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.table_files import write_table
 from tensor_stereo.types import Relation, StereoPair
 
@@ -39,6 +41,7 @@ class MatchSummary:
         num_agreeing: Those whose neighbours in one view contain those in the other.
         kept_by: What each verdict keeps: ``adjacency``, ``cardinality``, and ``score`` if there is one that can decide.
         rates: Of the verdict of the settings against ground truth, or None.
+        domain: Why the pair lies outside of what the probability was calibrated on, empty inside; None without one.
     """
 
     num_matches: int
@@ -48,6 +51,7 @@ class MatchSummary:
     num_agreeing: int
     kept_by: dict[str, int]
     rates: Rates | None = None
+    domain: str | None = None
 
 
 def classify_files(
@@ -96,7 +100,11 @@ def classify_files(
         gt_scale = find_scale(left, disparity_gt)
     pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale, sample_bits=sample_bits))
     output = run_pipeline([(pair.image0, pair.image1)], config)
-    truth = None if pair.disparity_gt is None else matches_against_gt(output.matches, [pair.disparity_gt])
+    truth = (
+        None
+        if pair.disparity_gt is None
+        else matches_against_gt(output.matches, [pair.disparity_gt], max_error_px=config.max_error_px)
+    )
     if out is not None:
         table = match_table(output, config, truth)
         with whole_file(out) as part:
@@ -114,6 +122,7 @@ def classify_files(
         num_agreeing=int(verdict.inlier_of("cardinality").sum()),
         kept_by={name: int(kept.sum()) for name, kept in _verdicts(output, config).items()},
         rates=None if truth is None else match_rates(verdict.inlier, *truth),
+        domain=None if output.domain is None else describe_domain(int(output.domain)),
     )
 
 
@@ -123,9 +132,10 @@ def match_table(
     """One row per match of one pair.
 
     Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained; ``inlier``, what the
-    verdict of the settings says; ``probability`` of an error of at most 1 px, or ``score`` where that is none;
-    ``inlier_adjacency``, ``inlier_cardinality`` and, if there is a score that can decide, ``inlier_score``;
-    ``relation`` by name, ``overlap, degree0, degree1``; and with ``truth`` = (correct, valid) also ``correct``, null
+    verdict of the settings says; ``probability`` of an error of at most ``max_error_px``, or ``score`` where that
+    is none; ``inlier_adjacency``, ``inlier_cardinality`` and, if there is a score that can decide, ``inlier_score``;
+    ``relation`` by name, ``overlap, degree0, degree1``; beside a probability ``domain``, in every row why the pair lies
+    outside of what it was calibrated on, empty inside; and with ``truth`` = (correct, valid) also ``correct``, null
     where ground truth is not known. ``config`` is that of the output; None means the defaults.
     """
     config = config or PipelineConfig()
@@ -149,6 +159,8 @@ def match_table(
     table = pl.DataFrame({name: column.numpy() for name, column in columns.items() if column is not None})
     names = {relation.value: relation.name.lower() for relation in Relation}
     table = table.with_columns(pl.col("relation").replace_strict(names, return_dtype=pl.String))
+    if output.domain is not None:
+        table = table.with_columns(pl.lit(describe_domain(int(output.domain)), pl.String).alias("domain"))
     if truth is None:
         return table
     correct, valid = (pl.Series(name, values.numpy()) for name, values in zip(("correct", "valid"), truth, strict=True))

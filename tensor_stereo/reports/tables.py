@@ -107,7 +107,8 @@ def rates_table(rows: Sequence[Row], detector: str, *, restriction: Restriction 
     ]
     letters = [title[-2] for title in groups]
     return Table(
-        title=f"Table {DETECTORS.index(detector) + 1}. {detector.upper()}, {restriction}: {', '.join(groups)}",
+        title=f"Table {DETECTORS.index(detector) + 1}. {detector.upper()}, {restriction}{_tolerance(rows)}: "
+        f"{', '.join(groups)}",
         columns=("scene", *(f"{letter} {heading}" for letter in letters for heading in RATES.values())),
         rows=_with_mean(body),
     )
@@ -137,7 +138,7 @@ def kept_table(rows: Sequence[Row], *, restriction: Restriction = "cardinality")
                 rates = (_mean([_value(row, rate) for row in found]) for rate in ("precision", "recall"))
                 body.append((f"{detector.upper()}, {name}", kept, *rates))
     columns = ("kept by", "matches", "precision", "recall")
-    return Table("Kept matches with known ground truth, mean over the scenes", columns, tuple(body))
+    return Table(f"Kept matches with known ground truth{_tolerance(rows)}, mean over the scenes", columns, tuple(body))
 
 
 def score_table(rows: Sequence[Row]) -> Table:
@@ -162,7 +163,7 @@ def score_table(rows: Sequence[Row]) -> Table:
             if found:
                 body.append((f"{detector.upper()}, {variant}", len(found), *means))
     names = ", ".join(dict.fromkeys(row["score"] for row in records.values()))
-    title = f"How the score ranks matches ({names or 'none'}), mean over the scenes"
+    title = f"How the score ranks matches ({names or 'none'}){_tolerance(rows)}, mean over the scenes"
     return Table(title, ("matches", "scenes", *SCORE_RATES.values()), tuple(body), decimals=3)
 
 
@@ -228,7 +229,7 @@ def matches_table(rows: Sequence[Row], *, restriction: Restriction = "cardinalit
         found = [records.get((scene, detector, "unconstrained")) for detector in detectors]
         body.append((scene, *(_value(r, name) for r in found for name in ("num_matches", "fraction_incorrect"))))
     headings = [f"{detector.upper()} {what}" for detector in detectors for what in ("matches", "incorrect")]
-    title = "Putative matches and the fraction of those with known ground truth that is incorrect"
+    title = f"Putative matches and the fraction of those with known ground truth that is incorrect{_tolerance(rows)}"
     return Table(title, ("scene", *headings), tuple(body))
 
 
@@ -276,6 +277,12 @@ def _index(rows: Sequence[Row], verdict: Verdict) -> dict[Key, Row]:
 
 def _index_variant(rows: Sequence[Row], verdict: Verdict, variant: str) -> dict[Key, Row]:
     return {key: record for key, record in _index(rows, verdict).items() if key[2] == variant}
+
+
+def _tolerance(rows: Sequence[Row]) -> str:
+    """What counts as correct, for a title; nothing at the paper's 1 px."""
+    found = sorted({row.get("max_error_px", 1.0) for row in rows} - {1.0})
+    return f", correct within {' or '.join(f'{value:g}' for value in found)} px" if found else ""
 
 
 def _with_mean(body: Sequence[tuple[Cell, ...]]) -> tuple[tuple[Cell, ...], ...]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
-from tensor_stereo.types import Matches
+from tensor_stereo.types import Matches, check_mask, check_vector
 
 _LEAST_AGREEING = 12  # matches that a fit needs
 _LEAST_VOTES = 3  # of neighbours, counted in each view
@@ -31,15 +31,23 @@ class Alignment(NamedTuple):
 
     Attributes:
         coefficients: (B, 3) float64, a in px and b, c in px per px; zero where nothing was fitted.
-        fitted: (B,) bool, whether enough matches agree on it. Where they do not, scores expect rows to be the same.
+        fitted: (B,) bool, whether at least 12 matches agree, and most of them lie within 1.5 px of rows that drift by
+            at most 5 %. Where they do not, scores expect rows to be the same.
+        num_agreeing: (B,) int64 matches that it was fitted to.
     """
 
     coefficients: Tensor
     fitted: Tensor
+    num_agreeing: Tensor
+
+    @property
+    def unfit(self) -> Tensor:
+        """(B,) bool, whether enough matches agree with their neighbours, but on no rows."""
+        return ~self.fitted & (self.num_agreeing >= _LEAST_AGREEING)
 
     def select(self, start: int, stop: int) -> Alignment:
         """That of pairs ``start`` to ``stop - 1``."""
-        return Alignment(self.coefficients[start:stop], self.fitted[start:stop])
+        return Alignment(*(values[start:stop] for values in self))
 
     def row_shift(self, keypoints0: Tensor, ptr: Tensor) -> Tensor:
         """(M,) float64 px, by how much the row of every match in view 1 is expected below that in view 0."""
@@ -52,7 +60,8 @@ def align_matches(matches: Matches, alignment: Alignment) -> Matches:
     """The matches with view 1 moved such that partners lie on one row. Gradients flow to the keypoints.
 
     >>> points = torch.tensor([[1.0, 2.0]])
-    >>> alignment = Alignment(torch.tensor([[3.0, 0.5, 0.0]], dtype=torch.float64), torch.tensor([True]))
+    >>> three_rows = torch.tensor([[3.0, 0.5, 0.0]], dtype=torch.float64)
+    >>> alignment = Alignment(three_rows, torch.tensor([True]), torch.tensor([40]))
     >>> align_matches(Matches(points, points, torch.tensor([0, 1])), alignment).keypoints1
     tensor([[ 1.0000, -1.5000]], dtype=torch.float64)
     """
@@ -66,8 +75,7 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
     """Fit row offset and slow row drift of every pair to the matches that agree with their neighbours.
 
     Two neighbours agree if their row offsets and their disparities are alike, which no common shift changes. The fit is
-    least squares, reweighted with ever smaller tolerance until wrong matches among them have no say (the weights of
-    Geman & McClure 1987).
+    that of :func:`fit_alignment`.
 
     Args:
         matches: B pairs of views that are rectified up to the alignment, coordinates in px.
@@ -90,10 +98,38 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
         tensor([[2.0000, 0.0100, 0.0000]], dtype=torch.float64)
     """
     check_match_graphs(matches, graphs)
+    return fit_alignment(matches, _agreeing(matches, graphs))
+
+
+@torch.no_grad()
+def fit_alignment(matches: Matches, agreeing: Tensor) -> Alignment:
+    """Fit row offset and slow row drift of every pair to some of its matches.
+
+    The fit is least squares, reweighted with ever smaller tolerance until wrong matches among them have no say (the
+    weights of Geman & McClure 1987).
+
+    Args:
+        matches: B pairs of views that are rectified up to the alignment, coordinates in px.
+        agreeing: (M,) bool, the matches that have a say, most of which are right. Their coordinates are finite.
+
+    Returns:
+        The alignment of every pair. It is zero where it stays below 0.1 px for all matches that have a say. A pair does
+        not depend on the others. No gradient.
+
+    Raises:
+        ValueError, TypeError: unless ``agreeing`` is a mask of the matches.
+
+    >>> left = torch.rand(40, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
+    >>> matches = Matches(left, left + torch.tensor([-5, 2]), torch.tensor([0, 40]))
+    >>> fit_alignment(matches, torch.arange(40) < 20).coefficients.round(decimals=3)
+    tensor([[2., -0., -0.]], dtype=torch.float64)
+    """
+    check_vector("agreeing", agreeing, matches.num_matches)
+    check_mask("agreeing", agreeing)
     num_pairs = matches.num_pairs
     y = matches.keypoints0[:, 1].double()
     offset = matches.keypoints1[:, 1].double() - y
-    rows = _agreeing(matches, graphs, offset).nonzero()[:, 0]  # only these have a say
+    rows = agreeing.nonzero()[:, 0]
     batch = ptr_to_batch(matches.ptr).index_select(0, rows)
     x, y, offset = (v.index_select(0, rows) for v in (matches.keypoints0[:, 0].double(), y, offset))
     one = torch.ones_like(x)
@@ -113,12 +149,13 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
     a, b, c = fit
     coefficients = torch.stack([a - b * middle[0] - c * middle[1], b, c], 1)
     keep = fitted & (largest >= _LEAST_SHIFT_PX)
-    return Alignment(torch.where(keep[:, None], coefficients, 0), fitted)
+    return Alignment(torch.where(keep[:, None], coefficients, 0), fitted, count.long())
 
 
-def _agreeing(matches: Matches, graphs: MatchGraphs, offset: Tensor) -> Tensor:
+def _agreeing(matches: Matches, graphs: MatchGraphs) -> Tensor:
     """(M,) bool, whether several neighbours of a match, counted in each view, move as it does."""
     x = matches.keypoints0[:, 0].double()
+    offset = matches.keypoints1[:, 1].double() - matches.keypoints0[:, 1].double()
     seen = torch.stack([offset, x - matches.keypoints1[:, 0].double(), x], 1).float()
     votes = torch.zeros_like(offset, dtype=torch.int32)
     for adjacency in (graphs.adjacency0, graphs.adjacency1):

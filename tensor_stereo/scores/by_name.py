@@ -3,18 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from torch import Tensor
 
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores.alignment import Alignment, estimate_alignment
-from tensor_stereo.scores.consensus import consensus_score
+from tensor_stereo.scores.consensus import consensus_probabilities
 from tensor_stereo.scores.domain import check_domain, check_images
 from tensor_stereo.scores.image_evidence import ImageEvidence, measure_images
-from tensor_stereo.scores.learned import LearnedScore, score_learned
+from tensor_stereo.scores.learned import LearnedScore, learned_probabilities
+from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.soft import build_soft_graphs, count_soft_neighbors, soft_jaccard
 from tensor_stereo.types import Matches
+
+
+class ScoredMatches(NamedTuple):
+    """Scores of M matches of B pairs, and what they rest on.
+
+    Attributes:
+        score: (M,) in [0, 1], higher is better, also of matches that a verdict leaves UNTESTED.
+        graphs: The Delaunay graphs of both views.
+        cumulative: (M, 5) probabilities of an error of at most each of
+            :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`; None for ``topology``, which is no probability.
+        alignment: Where the rows of view 0 lie in view 1, which the score has taken out; None where it takes none out.
+        domain: (B,) int8, values of :class:`tensor_stereo.scores.domain.Domain`: why a pair lies outside of what the
+            score was calibrated on; None for ``topology``.
+    """
+
+    score: Tensor
+    graphs: MatchGraphs
+    cumulative: Tensor | None = None
+    alignment: Alignment | None = None
+    domain: Tensor | None = None
+
+    def within(self, max_error_px: float) -> Tensor:
+        """(M,) the score for another tolerance; ``topology`` has none and is the same."""
+        return self.score if self.cumulative is None else probability_within(self.cumulative, max_error_px)
 
 
 def score_matches(
@@ -27,7 +53,7 @@ def score_matches(
     alignment: Alignment | None = None,
     temperature: Tensor | None = None,
     network: LearnedScore | None = None,
-) -> tuple[Tensor, MatchGraphs]:
+) -> ScoredMatches:
     """Score every match, by the score that the settings name.
 
     Args:
@@ -44,20 +70,24 @@ def score_matches(
         network: The network of ``learned``; None means the one with the weights of this package.
 
     Returns:
-        (M,) score in [0, 1], higher is better, also of matches that a verdict leaves UNTESTED; and the graphs. That of
-        ``consensus`` and of ``learned`` is the calibrated probability of an error of at most 1 px in a rectified pair;
-        that of ``topology`` is a similarity. Gradients as the scores say.
+        The scores. That of ``consensus`` and of ``learned`` is the calibrated probability of an error of at most
+        ``config.max_error_px``; that of ``topology`` is a similarity. Gradients as the scores say.
 
     Raises:
         ValueError: if the settings want no score, or for coordinates beyond 2**24 px, which only ``topology`` takes.
         TypeError: for images or evidence beside a score that looks at none.
 
+    Warns:
+        DomainWarning: if a pair lies outside of the domain of ``consensus`` or ``learned``.
+
     Example:
         >>> import torch
         >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
         >>> matches = Matches(left, left - torch.tensor([2.0, 0.0]), torch.tensor([0, 50]))
-        >>> score, graphs = score_matches(matches)
-        >>> torch.equal(score_matches(matches, graphs=graphs)[0], score)
+        >>> found = score_matches(matches)
+        >>> torch.equal(score_matches(matches, graphs=found.graphs).score, found.score)
+        True
+        >>> bool((score_matches(matches, FilterConfig(max_error_px=3)).score >= found.score).all())
         True
     """
     config = config or FilterConfig()
@@ -74,18 +104,20 @@ def score_matches(
         heat = config.temperature if temperature is None else temperature
         found = build_soft_graphs(matches, heat, unit=config.temperature_unit, **options)  # type: ignore[arg-type]
         counts = count_soft_neighbors(matches, found, heat, unit=config.temperature_unit, **options)  # type: ignore[arg-type]
-        return soft_jaccard(counts), found.graphs
+        return ScoredMatches(soft_jaccard(counts), found.graphs)
     if graphs is None:
         graphs = build_match_graphs(matches, **options)  # type: ignore[arg-type]
     if alignment is None and is_aligned(config):
         alignment = estimate_alignment(matches, graphs)
-    check_domain(matches, graphs, config, alignment)
+    domain = check_domain(matches, graphs, config, alignment)
     if name == "consensus":
-        return consensus_score(matches, graphs, config, alignment), graphs
-    if images is not None:
-        check_images(matches, images)
-        evidence = measure_images(*images, matches, graphs, alignment)
-    return score_learned(matches, graphs, evidence, config, alignment=alignment, network=network), graphs
+        cumulative = consensus_probabilities(matches, graphs, config, alignment)
+    else:
+        if images is not None:
+            domain |= check_images(matches, images)
+            evidence = measure_images(*images, matches, graphs, alignment)
+        cumulative = learned_probabilities(matches, graphs, evidence, config, alignment=alignment, network=network)
+    return ScoredMatches(probability_within(cumulative, config.max_error_px), graphs, cumulative, alignment, domain)
 
 
 def is_aligned(config: FilterConfig) -> bool:

@@ -7,37 +7,41 @@ import math
 import torch
 from torch import Tensor
 
-# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999), rectified or not; fitted by
+from tensor_stereo.scores.tolerance import NUM_TOLERANCES, rising
+
+# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999), rectified or not, at each of
+# TOLERANCES_PX, of which that of 1 px stands for all so far; fitted by
 # benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
-_CONSENSUS = {True: (0.59, 2.60), False: (0.65, 2.25)}
+_CONSENSUS = {True: ((0.59, 2.60),) * NUM_TOLERANCES, False: ((0.65, 2.25),) * NUM_TOLERANCES}
 _LEAST = 1e-4  # probability, of either outcome
 _NUM_KNOTS = 2048  # linear between them, the probability is off by less than 3e-6
 _PARTS = 2**32  # of one match; whole numbers add up to the same in any order
 
 
 def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
-    """The probability that a match is correct within 1 px, from the belief of its neighbours.
+    """The probabilities that a match is correct within each tolerance, from the belief of its neighbours.
 
     Args:
         belief: (M,) as :func:`tensor_stereo.scores.consensus.consensus_belief` gives it.
         rectified: whether the row offset was evidence.
 
     Returns:
-        (M,) float64, growing with the belief. Gradients flow where the belief lies between 1e-4 and 1 - 1e-4.
+        (M, 5) float64, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`, growing with the belief and never
+        falling with the tolerance. Gradients flow where the belief lies between 1e-4 and 1 - 1e-4.
 
-    >>> calibrate_consensus(torch.tensor([0.0, 0.5, 1.0]))
+    >>> calibrate_consensus(torch.tensor([0.0, 0.5, 1.0]))[:, 1]
     tensor([0.0555, 0.9309, 0.9997], dtype=torch.float64)
     """
     # Linear between knots: exponentials would differ in the last bit between a vector's lanes and its rest, and a batch
     # would not equal the loop over its pairs.
-    slope, bias = _CONSENSUS[rectified]
+    slope, bias = torch.tensor(_CONSENSUS[rectified], dtype=torch.float64, device=belief.device).unbind(1)
     end = math.log((1 - _LEAST) / _LEAST)
     logits = torch.linspace(-end, end, _NUM_KNOTS + 1, dtype=torch.float64, device=belief.device)
-    knots, values = torch.sigmoid(logits), torch.sigmoid(slope * logits + bias)
+    knots, values = torch.sigmoid(logits), torch.sigmoid(slope * logits[:, None] + bias)  # (K,), (K, 5)
     place = belief.double().clamp(knots[0], knots[-1])
     k = torch.searchsorted(knots, place.detach(), right=True).clamp(1, len(knots) - 1) - 1
-    share = (place - knots[k]) / (knots[k + 1] - knots[k])
-    return values[k] + share * (values[k + 1] - values[k])
+    share = ((place - knots[k]) / (knots[k + 1] - knots[k]))[:, None]
+    return rising(values[k] + share * (values[k + 1] - values[k]))
 
 
 @torch.no_grad()

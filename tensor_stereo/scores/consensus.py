@@ -17,6 +17,7 @@ from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.ops.registration import refuse_tangent
 from tensor_stereo.scores.alignment import Alignment
 from tensor_stereo.scores.calibration import calibrate_consensus
+from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Matches
 
 
@@ -25,17 +26,17 @@ def consensus_score(
 ) -> Tensor:
     """The calibrated probability that each match is right, by what its neighbours in both views believe.
 
-    It is :func:`consensus_belief` through :func:`tensor_stereo.scores.calibration.calibrate_consensus`.
-
     Args:
         matches: B pairs, as for :func:`consensus_belief`.
         graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
-        config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs.
+        config: The settings ``consensus``, ``max_error_px`` and ``backend`` are read; None means the defaults, for
+            rectified pairs.
         alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
     Returns:
-        (M,) probability that the disparity is right within 1 px, in the dtype of the keypoints. Gradients flow to both
-        keypoints and the cost, but not where a belief lies below 1e-4 or above 1 - 1e-4.
+        (M,) probability of an error of at most ``max_error_px``, of :func:`consensus_probabilities`, in the dtype of
+        the keypoints. Gradients flow to both keypoints and the cost, but not where a belief lies below 1e-4 or above
+        1 - 1e-4.
 
     Raises:
         ValueError, NotImplementedError: as :func:`consensus_belief`.
@@ -50,6 +51,37 @@ def consensus_score(
         >>> probability = consensus_score(matches, build_match_graphs(matches))
         >>> probability[0] < 0.1, probability[1:].min() > 0.9
         (tensor(True), tensor(True))
+    """
+    config = config or FilterConfig()
+    return probability_within(consensus_probabilities(matches, graphs, config, alignment), config.max_error_px)
+
+
+def consensus_probabilities(
+    matches: Matches, graphs: MatchGraphs, config: FilterConfig | None = None, alignment: Alignment | None = None
+) -> Tensor:
+    """The calibrated probabilities that each match is right within each tolerance.
+
+    They are :func:`consensus_belief` through :func:`tensor_stereo.scores.calibration.calibrate_consensus`.
+
+    Args:
+        matches: B pairs, as for :func:`consensus_belief`.
+        graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
+        config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+
+    Returns:
+        (M, 5) in the dtype of the keypoints, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`; no row falls.
+        Gradients as those of :func:`consensus_score`.
+
+    Raises:
+        ValueError, NotImplementedError: as :func:`consensus_belief`.
+
+    >>> import torch
+    >>> from tensor_stereo.graphs import build_match_graphs
+    >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
+    >>> matches = Matches(left, left - torch.tensor([5.0, 0.0]), torch.tensor([0, 50]))
+    >>> consensus_probabilities(matches, build_match_graphs(matches)).shape
+    torch.Size([50, 5])
     """
     config = config or FilterConfig()
     belief = _believe(matches, graphs, config, alignment)

@@ -30,7 +30,7 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
-from tensor_stereo.scores.tolerance import NUM_TOLERANCES, TOLERANCES_PX, rising
+from tensor_stereo.scores.tolerance import NUM_TOLERANCES, TOLERANCES_PX, probability_within, rising
 from tensor_stereo.types import Adjacency, Matches
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
@@ -99,8 +99,8 @@ class LearnedScore(nn.Module):
             alignment: Where the rows of view 0 lie in view 1; None: they are the same.
 
         Returns:
-            (M, 5) float32 each, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`. Gradients flow to the keypoints
-            from all that is continuous in them, and are finite.
+            (M, 5) float32 each, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`. Gradients flow to the
+            keypoints from all that is continuous in them, and are finite.
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
             logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config, alignment))
@@ -285,15 +285,14 @@ def score_learned(
 
     Args:
         matches: B pairs of rectified views; ``cost`` may be missing.
-        graphs: of the same matches.
-        evidence: of their images, or None.
-        config: ``backend`` is read; None means the defaults.
+        graphs: The graphs of the same matches.
+        evidence: What their images say, or None.
+        config: ``max_error_px`` and ``backend`` are read; None means the defaults.
         alignment: Where the rows of view 0 lie in view 1; None: they are the same.
         network: The network that scores; None means the one with the weights of this package.
 
     Returns:
-        (M,) float32 in (0, 1), higher is better. A match that is no vertex of the graphs (a duplicate) is scored from
-        its own quantities. Gradients flow to the keypoints from all that is continuous in them, and are finite.
+        (M,) float32 probability of an error of at most ``max_error_px``, of :func:`learned_probabilities`.
 
     Raises:
         ValueError: for graphs or evidence of another number of matches.
@@ -308,6 +307,44 @@ def score_learned(
         >>> bool(score[:30].max() < score[30:].median())
         True
     """
+    config = config or FilterConfig()
+    cumulative = learned_probabilities(matches, graphs, evidence, config, alignment=alignment, network=network)
+    return probability_within(cumulative, config.max_error_px)
+
+
+def learned_probabilities(
+    matches: Matches,
+    graphs: MatchGraphs,
+    evidence: ImageEvidence | None = None,
+    config: FilterConfig | None = None,
+    *,
+    alignment: Alignment | None = None,
+    network: LearnedScore | None = None,
+) -> Tensor:
+    """Calibrated probabilities of every match being correct within each tolerance.
+
+    Args:
+        matches: B pairs of rectified views; ``cost`` may be missing.
+        graphs: The graphs of the same matches.
+        evidence: What their images say, or None.
+        config: ``backend`` is read; None means the defaults.
+        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+        network: The network that scores; None means the one with the weights of this package.
+
+    Returns:
+        (M, 5) float32, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`; no row falls. A match that is no
+        vertex of the graphs (a duplicate) is scored from its own quantities. Gradients flow to the keypoints from all
+        that is continuous in them, and are finite.
+
+    Raises:
+        ValueError: for graphs or evidence of another number of matches.
+
+    >>> from tensor_stereo.graphs import build_match_graphs
+    >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
+    >>> matches = Matches(left, left - torch.tensor([5.0, 0.0]), torch.tensor([0, 50]))
+    >>> learned_probabilities(matches, build_match_graphs(matches)).shape
+    torch.Size([50, 5])
+    """
     check_fit(matches, graphs, evidence)
     network = load_learned(matches.keypoints0.device) if network is None else network
     if torch.compiler.is_compiling():  # the lengths of the pairs are not known yet
@@ -318,7 +355,7 @@ def score_learned(
         for pairs, part, own, seen in _parts(matches, graphs, evidence)
     ]
     if not parts:
-        return (matches.keypoints0 + matches.keypoints1).float()[:, 0]  # empty, with a gradient like any other
+        return (matches.keypoints0 + matches.keypoints1).float()[:, :1].expand(-1, NUM_TOLERANCES)  # with a gradient
     return torch.cat(parts)
 
 

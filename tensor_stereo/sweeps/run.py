@@ -10,6 +10,7 @@ import platform
 import signal
 import threading
 import time
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ import torch
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import read_manifest
 from tensor_stereo.evaluation.trials import TrialRunner
+from tensor_stereo.scores.domain import DomainWarning
 from tensor_stereo.sweeps.engines import Engine, LocalEngine, Outcome
 from tensor_stereo.sweeps.grid import simplify
 from tensor_stereo.sweeps.log import log_to_file
@@ -200,11 +202,13 @@ def check_trials(config: SweepConfig) -> None:
     """
     noise = torch.randint(0, 256, (1, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     runner = TrialRunner(StereoPair("noise", noise, noise, torch.zeros(64, 64)))
-    for number, trial in enumerate(config.trials):
-        try:
-            runner.run(trial)
-        except (ValueError, TypeError, RuntimeError, MemoryError) as error:
-            raise ValueError(f"point {number} of the grid ({trial.detector}): {error}") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DomainWarning)  # noise may be outside of it
+        for number, trial in enumerate(config.trials):
+            try:
+                runner.run(trial)
+            except (ValueError, TypeError, RuntimeError, MemoryError) as error:
+                raise ValueError(f"point {number} of the grid ({trial.detector}): {error}") from error
 
 
 class _Driver:
@@ -267,6 +271,10 @@ class _Driver:
             if result.error is not None:
                 self._num_failed += 1
                 LOG.error("unit failed", extra={"unit": result.unit, "reason": result.error})
+            domains = sorted({row["domain"] for row in result.rows if row["domain"]})
+            if domains:
+                names = {name: result.rows[0][name] for name in ("dataset", "scene")}
+                LOG.warning("outside of the domain", extra={"unit": result.unit, **names, "domain": domains})
             self._store.add(result)
         if self._on_progress is not None:
             self._on_progress(self.progress())

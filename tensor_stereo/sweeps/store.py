@@ -37,7 +37,7 @@ from tensor_stereo.table_files import write_table
 LOG = logging.getLogger(__name__)
 _MAX_ROWS = 20_000  # that wait for their part, about 80 MB; a hundred matches weigh as much as a row
 _FOLDERS = ("metrics", "matches")
-FORMAT = 2  # of the run folder; another number when settings or columns are renamed, removed or change their meaning
+FORMAT = 3  # of the run folder; another number when settings or columns are renamed, removed or change their meaning
 METRICS_SCHEMA: dict[str, Any] = {
     "unit": pl.Int32,  # number of the unit in the plan
     **ROW_SCHEMA,

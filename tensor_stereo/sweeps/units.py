@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import PairFiles, read_pair
 from tensor_stereo.evaluation.trials import Trial, TrialRunner
+from tensor_stereo.scores.domain import DomainWarning
 from tensor_stereo.sweeps.plan import Task
 
 
@@ -46,14 +48,16 @@ def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> list[UnitResult]:
     results = []
     runner: TrialRunner | None = None
     files: PairFiles | None = None
-    for task in tasks:
-        try:
-            if runner is None or files != task.files:
-                runner = None  # the last pair's images go before the next ones come
-                runner, files = TrialRunner(read_pair(task.files)), task.files
-            results.append(_run_unit(config, task, runner))
-        except Exception as error:
-            results.append(failed_unit(config, task, runner.stage if runner else "read", error))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DomainWarning)  # the rows say it, and with them the log
+        for task in tasks:
+            try:
+                if runner is None or files != task.files:
+                    runner = None  # the last pair's images go before the next ones come
+                    runner, files = TrialRunner(read_pair(task.files)), task.files
+                results.append(_run_unit(config, task, runner))
+            except Exception as error:
+                results.append(failed_unit(config, task, runner.stage if runner else "read", error))
     return results
 
 

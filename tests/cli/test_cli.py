@@ -124,13 +124,15 @@ def test_a_verdict_of_the_paper_pays_for_no_score_and_shows_one_that_is_asked_fo
     main([*command, "--score", "consensus"])
     table, printed = pl.read_parquet(out), _printed(capsys)
     assert table.select(plain.columns).equals(plain)
-    assert set(table.columns) - set(plain.columns) == {"probability", "inlier_score"}
+    assert set(table.columns) - set(plain.columns) == {"probability", "inlier_score", "domain"}
+    assert table["domain"].unique().to_list() == [""]
+    assert printed["domain"] == "inside"
     assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "untested"))
     assert int(printed["kept_by_score"]) == table["inlier_score"].sum() != int(printed["num_kept"])
     main([*command, "--score", "topology"])  # no probability, so it decides nothing
     table, printed = pl.read_parquet(out), _printed(capsys)
     assert set(table.columns) - set(plain.columns) == {"score"}
-    assert "kept_by_score" not in printed
+    assert not {"kept_by_score", "domain"} & set(printed)
 
 
 def test_the_figure_shows_the_verdict_that_decides_and_beside_a_score_that_of_the_paper(
@@ -340,3 +342,28 @@ def test_index_writes_a_manifest_of_folders_and_lists(
     with pytest.raises(SystemExit) as stop:
         main(["index", str(tmp_path / "none"), "--out", str(out)])
     assert stop.value.code == 2
+
+
+@pytest.mark.filterwarnings("ignore:the score expects matches that agree")
+def test_classify_marks_a_pair_of_two_scenes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    views = [render_pair(0).image0, render_pair(1).image1]
+    for k, view in enumerate(views):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), view[0].numpy())
+    main(["classify", str(tmp_path / "0.png"), str(tmp_path / "1.png"), "--out", str(tmp_path / "matches.csv")])
+    assert _printed(capsys)["domain"] == "agreement"
+    assert pl.read_csv(tmp_path / "matches.csv")["domain"].unique().to_list() == ["agreement"]
+
+
+def test_every_command_takes_the_tolerance(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    files, out = [str(scene / "im0.png"), str(scene / "im1.png")], tmp_path / "matches.parquet"
+    kept = []
+    for px in ("0.5", "1", "5"):
+        main(["classify", *files, "--max-error-px", px, "--out", str(out)])
+        kept.append(int(_printed(capsys)["num_kept"]))
+        main(["filter", str(out), "--out", str(tmp_path / "kept.parquet"), "--max-error-px", px])
+        assert int(_printed(capsys)["num_kept"]) > 0
+    assert kept == sorted(kept)
+    command = ["evaluate", str(scene.parent.parent), "--detectors", "fast", "--scenes", "RENDERED"]
+    main([*command, "--max-error-px", "3"])
+    assert "learned, probability 0.5 within 3 px (S)" in capsys.readouterr().out
+    fails(["classify", *files, "--max-error-px", "9"], capsys, "--max-error-px", "[0.5, 5]")

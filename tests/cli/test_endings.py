@@ -141,7 +141,7 @@ def test_rates_without_any_known_truth_fail(release: Path, tmp_path: Path, capsy
     assert "no match has known ground truth" in capsys.readouterr().err
 
 
-@pytest.mark.filterwarnings("ignore:the score expects rectified pairs")
+@pytest.mark.filterwarnings("ignore:the score expects")
 def test_an_empty_result_of_matches_that_agree_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = np.random.default_rng(0).random((200, 2)) * [320, 240]
     turned = points @ np.array([[0.8, -0.6], [0.6, 0.8]])

@@ -21,11 +21,14 @@ from tensor_stereo.configs import (
     Verdict,
 )
 from tensor_stereo.datasets.synthetic.rendering import render_pair
+from tensor_stereo.evaluation import trials
 from tensor_stereo.evaluation.metrics import roc_auc, specificity_at_sensitivity
 from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES, TrialRunner, stage_keys
+from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.ops import backends
-from tensor_stereo.pipeline import run_pipeline
+from tensor_stereo.pipeline import run_pipeline, score_pairs
+from tensor_stereo.scores.domain import DomainWarning
 from tensor_stereo.scores.image_evidence import measure_images
 
 PAIR = render_pair(0)
@@ -160,7 +163,8 @@ def test_rows_name_the_settings_of_the_score_that_ran_and_leave_the_others_null(
         (TOPOLOGY, {"matching": MatchingConfig(mutual=True)}, "match"),
         (TOPOLOGY, {"backend": "scipy"}, "match"),
         (PAPER, {"backend": "scipy"}, "match"),
-        (TOPOLOGY, {"max_error_px": 2.0}, "perturb"),
+        (TOPOLOGY, {"max_error_px": 2.0}, None),
+        (TrialConfig(), {"max_error_px": 2.0}, None),
         (TOPOLOGY, {"constrained": True}, "group"),
         (TOPOLOGY, {"tie_tolerance": 0.0}, "graph"),
         (TOPOLOGY, {"score": "learned"}, "score"),
@@ -253,3 +257,37 @@ def test_the_ratio_of_sift_belongs_to_the_matcher() -> None:
     after = stage_keys(TrialConfig(detector="sift", sift=SIFTConfig(max_ratio=0.6)))
     assert before["detect"] == after["detect"]
     assert before["match"] != after["match"]
+
+
+@pytest.mark.parametrize("score", ["learned", "consensus", "none"])
+def test_tolerances_share_matches_graphs_and_score(score: ScoreName, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One forward pass; rates, verdicts and scores are those of each tolerance alone."""
+    verdict: Verdict = "cardinality" if score == "none" else "score"
+    settings = [TrialConfig(verdict=verdict, score=score, max_error_px=px) for px in (1.0, 0.5, 3.0, 5.0)]
+    expected = [TrialRunner(PAIR).run(trial) for trial in settings]
+    passes = []
+    monkeypatch.setattr(trials, "score_pairs", lambda *given: passes.append(0) or score_pairs(*given))
+    runner = TrialRunner(PAIR)
+    found = [runner.run(trial) for trial in settings]
+    assert len(passes) == (score != "none")
+    for shared, alone in zip(found, expected, strict=True):
+        assert shared.graphs is found[0].graphs
+        assert torch.equal(shared.correct, alone.correct)
+        assert torch.equal(shared.classification.inlier, alone.classification.inlier)
+        truth, _ = matches_against_gt(shared.matches, [PAIR.disparity_gt], max_error_px=shared.config.max_error_px)
+        assert torch.equal(shared.correct, truth)
+        if score != "none":
+            images = [(PAIR.image0, PAIR.image1)]
+            assert torch.equal(shared.score, alone.score)
+            assert torch.equal(shared.score, run_pipeline(images, shared.config).score)
+        row = shared.row()
+        assert row["max_error_px"] == shared.config.max_error_px
+        assert row["domain"] == (None if score == "none" else "")
+    counts = [int(trial.correct.sum()) for trial in found]
+    assert counts[1] < counts[0] < counts[2] <= counts[3]
+
+
+def test_a_pair_outside_of_the_domain_says_so_in_its_row() -> None:
+    trial = TrialConfig(outlier_rate=1.0)
+    with pytest.warns(DomainWarning, match="those of pair 0 hardly do"):
+        assert TrialRunner(PAIR).run(trial).row()["domain"] == "agreement"

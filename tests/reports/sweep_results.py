@@ -61,6 +61,7 @@ def make_grid(
             "threshold": 0.4 if (verdict, score) == ("score", "topology") else None,
             "target_sensitivity": None,
             "min_precision": None,
+            "max_error_px": 1.0,
         }
         for detector, variant, verdict, score, rate in itertools.product(*axes)
         for slope in (slopes if score == "consensus" else (None,))
@@ -136,7 +137,8 @@ def _measure(trial: dict[str, Any], pair: int, seed: int, difficulty: float, gai
     spent |= {"group": 7e-3} if trial["variant"] == "constrained" else {}
     spent |= {"score": 2e-3} if trial["score"] != "none" else {}
     seconds = {stage: spent.get(stage, 0.0) * math.exp(draw.normal(0, 0.2)) for stage in STAGES}
-    return measured | {"seconds": seconds}
+    domain = "" if trial["score"] in ("learned", "consensus") else None
+    return measured | {"domain": domain, "seconds": seconds}
 
 
 def make_png() -> bytes:

@@ -10,6 +10,7 @@ import pytest
 from tensor_stereo.configs import Restriction
 from tensor_stereo.reports.tables import (
     Table,
+    kept_table,
     matches_table,
     paper_tables,
     rates_table,
@@ -271,3 +272,15 @@ def test_tables_name_what_is_wrong() -> None:
         rates_table([{name: value for name, value in row.items() if name != "npv"} for row in rows], "sift")
     with pytest.raises(ValueError, match="rows must have 2 cells"):
         Table("", ("a", "b"), (("x",),))
+
+
+def test_titles_name_a_tolerance_other_than_that_of_the_paper() -> None:
+    record = {"scene": "Art", "detector": "fast", "variant": "unconstrained", "verdict": "score", "score": "learned"}
+    record |= dict.fromkeys(("sensitivity", "specificity", "ppv", "npv", "precision", "recall", "auc"), 0.5)
+    record |= {"specificity_at_sensitivity_96": 0.5, "true_negative": 3, "false_negative": 1}
+    record |= {"num_matches": 9, "fraction_incorrect": 0.5}
+    for max_error_px, words in ((1.0, False), (3.0, True)):
+        rows = [record | {"max_error_px": max_error_px}]
+        for table in (rates_table(rows, "fast"), kept_table(rows), score_table(rows), matches_table(rows)):
+            assert ("correct within 3 px" in table.title) == words
+        assert ("learned, probability 0.5 within 3 px (S)" in rates_table(rows, "fast").title) == words

@@ -239,7 +239,7 @@ def weights_of(network: LearnedScore) -> Weights:
 
 
 def infer(weights: Weights, seen: Seen, num_rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """(M,) logits and (rounds, M) logits of the beliefs before each round."""
+    """(M, 5) logits at the tolerances and (rounds, M) logits of the beliefs before each round."""
     cost = _normalize(weights, "cost", seen.cost) * seen.has_cost[:, None]
     flags = np.stack([seen.has_cost, seen.has_image], 1)
     state = _linear(weights, "enter", np.concatenate([_normalize(weights, "nodes", seen.nodes), cost, flags], 1))
@@ -265,7 +265,15 @@ def infer(weights: Weights, seen: Seen, num_rounds: int = 3) -> tuple[np.ndarray
         state = (state - state.mean(1, keepdims=True)) / np.sqrt(state.var(1, keepdims=True) + 1e-5)
         state = state * own["norm.weight"] + own["norm.bias"]
     head = _linear(weights, "head", state) + _linear(weights, "head_whole", mean_of_pair @ state)
-    return _linear(weights, "last", np.maximum(head, 0))[:, 0], np.array(beliefs)
+    outputs = _linear(weights, "last", np.maximum(head, 0))
+    one, steps = outputs[:, 1:2], np.log1p(np.exp(outputs))  # the logit at 1 px, and how far apart the others lie
+    return np.concatenate([one - steps[:, :1], one, one + steps[:, 2:].cumsum(1)], 1), np.array(beliefs)
+
+
+def calibrate(weights: Weights, logit: np.ndarray) -> np.ndarray:
+    """(M, 5) probabilities: a logistic regression at each tolerance, and none below that of a smaller one."""
+    slope, bias = weights["calibration"].T
+    return np.maximum.accumulate(1 / (1 + np.exp(-slope * logit - bias)), 1)
 
 
 def plane_columns(belief: np.ndarray, seen: Seen) -> np.ndarray:

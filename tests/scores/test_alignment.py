@@ -12,7 +12,7 @@ from tensor_stereo.batching import collate_matches
 from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import measure_images
-from tensor_stereo.scores.alignment import Alignment, align_matches, estimate_alignment
+from tensor_stereo.scores.alignment import Alignment, align_matches, estimate_alignment, fit_alignment
 
 SIZE = torch.tensor([450.0, 370.0], dtype=torch.float64)
 
@@ -96,6 +96,32 @@ def test_a_view_that_is_turned_does_not_fit() -> None:
     assert not estimate(replace(matches, keypoints1=matches.keypoints1 @ turn.T)).fitted.any()
 
 
+def test_too_few_that_agree_and_rows_that_do_not_fit_are_told_apart() -> None:
+    straight, random = surface(1, 600, 0.2), surface(0, 300, 1.0)
+    steep = moved(surface(1, 600, 0.2), (0, 0.08, 0))
+    alignment = estimate(collate_matches([straight, random, steep, surface(0, 0)]))
+    assert alignment.fitted.tolist() == [True, False, False, False]
+    assert alignment.unfit.tolist() == [False, False, True, False]
+    assert (alignment.num_agreeing >= 12).tolist() == [True, False, True, False]
+
+
+def test_the_fit_looks_at_the_chosen_matches_alone() -> None:
+    matches = surface(2, 400, 0.5, (6, 0.01, 0.0))
+    right = torch.arange(400) >= 200
+    found = fit_alignment(matches, right)
+    assert (found.fitted.item(), found.num_agreeing.item()) == (True, 200)
+    shift = found.row_shift(matches.keypoints0, matches.ptr)
+    assert (shift - 6 - 0.01 * matches.keypoints0[:, 0]).abs().max() < 0.1
+    right_alone = Matches(matches.keypoints0[200:], matches.keypoints1[200:], torch.tensor([0, 200]))
+    alone = fit_alignment(right_alone, torch.ones(200, dtype=torch.bool))
+    assert torch.equal(found.coefficients, alone.coefficients)
+    assert not fit_alignment(matches, torch.arange(400) < 11).fitted
+    with pytest.raises(TypeError, match="agreeing must be bool"):
+        fit_alignment(matches, right.long())
+    with pytest.raises(ValueError, match="agreeing"):
+        fit_alignment(matches, right[1:])
+
+
 def test_a_batch_is_the_loop_over_its_pairs() -> None:
     pairs = [surface(k, 20 + 90 * k, 0.1 * k, (3 * k - 8, 0.004 * k, -0.003 * k)) for k in range(6)]
     pairs.insert(2, surface(0, 0))
@@ -117,9 +143,8 @@ def test_the_order_of_the_matches_changes_nothing_but_rounding() -> None:
 
 def test_aligned_matches_lie_on_their_rows() -> None:
     matches = surface(4, 400, 0.0, (-7, 0.02, 0.01), noise_px=0.0)
-    aligned = align_matches(
-        matches, Alignment(torch.tensor([[-7, 0.02, 0.01]], dtype=torch.float64), torch.tensor([True]))
-    )
+    known = Alignment(torch.tensor([[-7, 0.02, 0.01]], dtype=torch.float64), torch.tensor([True]), torch.tensor([400]))
+    aligned = align_matches(matches, known)
     torch.testing.assert_close(aligned.keypoints1[:, 1], matches.keypoints0[:, 1], rtol=0, atol=1e-9)
     assert torch.equal(aligned.keypoints1[:, 0], matches.keypoints1[:, 0])
 
@@ -192,7 +217,7 @@ def test_windows_are_compared_along_the_rows_of_the_alignment() -> None:
             [image],
             matches,
             build_match_graphs(matches),
-            Alignment(torch.tensor([[a, 0, 0]]).double(), fitted),
+            Alignment(torch.tensor([[a, 0, 0]]).double(), fitted, torch.tensor([60])),
         )
         for image, matches, a in ((pair.image1, straight, 0.0), (lowered, lower, 3.0))
     ]

@@ -16,6 +16,7 @@ import tensor_stereo as ts
 from tensor_stereo.batching import collate_matches, split, split_matches
 from tensor_stereo.configs import UNRECTIFIED, FilterConfig
 from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.scores import calibration
 from tensor_stereo.scores.calibration import calibrate_consensus, keep_by_target
 from tensor_stereo.scores.consensus import consensus_belief
 from tests.test_classification import random_pair
@@ -80,7 +81,7 @@ def test_a_calibrated_score_reaches_its_target() -> None:
 def test_calibration_is_a_logistic_regression_and_keeps_the_order() -> None:
     score = torch.linspace(0, 1, 10_001, dtype=torch.float64)
     for rectified in (True, False):
-        found = calibrate_consensus(score, rectified=rectified).numpy()
+        found = calibrate_consensus(score, rectified=rectified)[:, 1].numpy()
         low, middle = found[[2000, 5000]]
         slope = (logit(middle) - logit(low)) / (logit(0.5) - logit(0.2))
         expected = expit(slope * logit(np.clip(score.numpy(), 1e-4, 1 - 1e-4)) + logit(middle))
@@ -95,9 +96,21 @@ def test_a_probability_does_not_depend_on_the_length_of_its_vector(length: int, 
     assert torch.equal(calibrate_consensus(belief[:length], rectified=rectified), whole[:length])
 
 
+def test_every_tolerance_has_its_own_regression_and_none_falls(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = ((0.9, -0.5), (0.7, 1.0), (0.6, 1.5), (0.5, 1.0), (0.4, 3.0))  # that of 3 px crosses that of 2 px
+    monkeypatch.setattr(calibration, "_CONSENSUS", {True: table, False: table})
+    belief = torch.linspace(1e-4, 1 - 1e-4, 501, dtype=torch.float64)
+    found = calibrate_consensus(belief)
+    assert found.shape == (501, 5)
+    assert (found.diff(dim=1) >= 0).all()
+    expected = np.stack([expit(slope * logit(belief.numpy()) + bias) for slope, bias in table], 1)
+    assert (np.diff(expected, axis=1) < 0).any()
+    np.testing.assert_allclose(found, np.maximum.accumulate(expected, 1), rtol=0, atol=3e-6)
+
+
 def test_calibration_has_the_slope_of_a_logistic_regression() -> None:
     belief = torch.tensor([1e-5, 1e-3, 0.2, 0.5, 0.9], dtype=torch.float64, requires_grad=True)
-    probability = calibrate_consensus(belief)
+    probability = calibrate_consensus(belief)[:, 1]
     (slope,) = torch.autograd.grad(probability.sum(), belief)
     expected = 0.59 * probability * (1 - probability) / (belief * (1 - belief))  # slope of the log-odds: 0.59
     assert slope[0] == 0  # saturated
@@ -137,7 +150,7 @@ def test_pairs_that_are_not_rectified_have_a_calibration_of_their_own() -> None:
     output = ts.DelaunayFilter(consensus=UNRECTIFIED, min_precision=0.9)(matches)
     tested = output.relation != 0
     belief = consensus_belief(matches, build_match_graphs(matches), FilterConfig(consensus=UNRECTIFIED))
-    probability = calibrate_consensus(belief, rectified=False).to(belief.dtype)
+    probability = calibrate_consensus(belief, rectified=False)[:, 1].to(belief.dtype)
     assert torch.equal(output.score, torch.where(tested, probability, 0))
     assert torch.equal(output.inlier, keep_by_target(probability, tested, matches.ptr, min_precision=0.9))
 

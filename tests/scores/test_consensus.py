@@ -12,7 +12,8 @@ from torch.autograd import forward_ad
 from tensor_stereo import UNRECTIFIED, ConsensusConfig, FilterConfig, Matches
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.calibration import calibrate_consensus
-from tensor_stereo.scores.consensus import consensus_belief, consensus_score
+from tensor_stereo.scores.consensus import consensus_belief, consensus_probabilities, consensus_score
+from tensor_stereo.scores.tolerance import probability_within
 from tests.oracles import installed_backends
 
 BACKENDS = installed_backends()
@@ -58,7 +59,11 @@ def test_the_score_is_the_calibrated_belief_of_its_own_settings(backend: str, se
     matches, config = _matches(5, 60), FilterConfig(consensus=settings, backend=backend)  # type: ignore[arg-type]
     graphs = build_match_graphs(matches)
     belief, score = consensus_belief(matches, graphs, config), consensus_score(matches, graphs, config)
-    assert torch.equal(score, calibrate_consensus(belief, rectified=settings.rectified))
+    cumulative = consensus_probabilities(matches, graphs, config)
+    assert torch.equal(cumulative, calibrate_consensus(belief, rectified=settings.rectified))
+    assert torch.equal(score, cumulative[:, 1])
+    wide = dataclasses.replace(config, max_error_px=2.5)
+    assert torch.equal(consensus_score(matches, graphs, wide), probability_within(cumulative, 2.5))
     assert not torch.equal(belief, consensus_belief(matches, graphs))
 
 

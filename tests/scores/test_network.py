@@ -9,13 +9,15 @@ import pytest
 import torch
 
 from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores import learned
 from tensor_stereo.scores.image_evidence import ImageEvidence
-from tensor_stereo.scores.learned import LearnedScore, load_learned, score_learned
+from tensor_stereo.scores.learned import LearnedScore, learned_probabilities, load_learned, score_learned
 from tensor_stereo.scores.learned_inputs import Quantities, measure_quantities
+from tensor_stereo.scores.tolerance import TOLERANCES_PX, probability_within
 from tensor_stereo.types import Adjacency, Matches
-from tests.scores.learned_oracle import infer, random_evidence, random_pairs, see, weights_of
+from tests.scores.learned_oracle import calibrate, infer, random_evidence, random_pairs, see, weights_of
 
 # Quantities differ by some 1e-5 (test_learned_inputs.py). The weights below keep the gain of each layer near one,
 # LayerNorm that of a round: the logits, which are of size one, differ as little. A step that is left out, a wrong sign
@@ -35,7 +37,7 @@ def random_network(seed: int, num_rounds: int = 3) -> LearnedScore:
         else:
             offset = 1.0 if name.endswith(("_scale", "norm.weight")) else 0.0
             state[name] = offset + 0.3 * noise
-    state["calibration"] = torch.tensor([0.7, -0.4])
+    state["calibration"] = torch.tensor([[0.7, -0.4], [0.9, 0.1], [0.8, -0.2], [1.1, 0.3], [0.7, 0.5]])
     network.load_state_dict(state)
     return network.eval().requires_grad_(False)
 
@@ -49,10 +51,9 @@ def assert_same(
     expected, between = infer(weights_of(network), seen, len(network.rounds))
     np.testing.assert_allclose(torch.stack(beliefs), between, rtol=0, atol=ATOL)
     np.testing.assert_allclose(logit, expected, rtol=0, atol=ATOL)
-    slope, bias = network.calibration.tolist()
     again, probability = network(matches, graphs, evidence)
     assert torch.equal(again, logit)
-    np.testing.assert_allclose(probability, 1 / (1 + np.exp(-slope * expected - bias)), rtol=0, atol=ATOL)
+    np.testing.assert_allclose(probability, calibrate(weights_of(network), expected), rtol=0, atol=ATOL)
 
 
 @pytest.mark.parametrize("shown", ["cost", "images", "both", "some images", "nothing"])
@@ -94,7 +95,7 @@ def test_neighbors_many_mean_distances_away() -> None:
 
 
 def test_untrained_network_needs_no_calibration() -> None:
-    logit = torch.linspace(-3, 3, 7)
+    logit = torch.linspace(-3, 3, 35).reshape(7, 5)
     assert torch.equal(LearnedScore().calibrate(logit), logit.sigmoid())
 
 
@@ -143,15 +144,28 @@ def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.Monk
     for given in (matches, replace(matches, cost=None)):
         seen, network = see(given, evidence), load_learned()
         logit, _ = infer(weights_of(network), seen)
-        slope, bias = network.calibration.tolist()
-        found = score_learned(given, build_match_graphs(given), evidence)
+        found = learned_probabilities(given, build_match_graphs(given), evidence)
         # these weights tell by disparities: a logit changes by up to 10 times the difference of a quantity
-        np.testing.assert_allclose(found, 1 / (1 + np.exp(-slope * logit - bias)), rtol=0, atol=1e-3)
+        np.testing.assert_allclose(found, calibrate(weights_of(network), logit), rtol=0, atol=1e-3)
     assert sizes == [40, 1, 45, 5] * 2
 
 
 def test_no_pairs_have_no_score() -> None:
     matches = random_pairs(0, ())
-    score = score_learned(matches, build_match_graphs(matches))
+    graphs = build_match_graphs(matches)
+    score = score_learned(matches, graphs)
     assert score.shape == (0,)
     assert score.dtype == torch.float32
+    assert learned_probabilities(matches, graphs).shape == (0, 5)
+
+
+@pytest.mark.parametrize("max_error_px", [0.5, 1.0, 1.25, 4.0, 5.0])
+def test_the_score_is_the_probability_at_the_tolerance_of_the_settings(max_error_px: float) -> None:
+    matches = random_pairs(2)
+    graphs, config = build_match_graphs(matches), FilterConfig(max_error_px=max_error_px)
+    score = score_learned(matches, graphs, config=config, network=random_network(2))
+    cumulative = learned_probabilities(matches, graphs, config=config, network=random_network(2))
+    assert (cumulative.diff(dim=1) >= 0).all()
+    assert torch.equal(score, probability_within(cumulative, max_error_px))
+    table = [np.interp(max_error_px, TOLERANCES_PX, row) for row in cumulative.double().numpy()]
+    np.testing.assert_allclose(score, table, rtol=0, atol=1e-6)

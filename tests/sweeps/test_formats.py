@@ -190,9 +190,9 @@ def _add(name: str, value: Any) -> Edit:
         (_add("sharpness", 3), ["setting sharpness is unknown to this release", "a later one has written the run"]),
         (_add("consensus.sharpness", None), ["setting consensus.sharpness is unknown"]),
         (_add("fast.sharpness", [1]), ["setting fast.sharpness is unknown"]),
-        (lambda config: config.update(format=1), ["is a run of format 1, this release reads format 2"]),
-        (lambda config: config.update(format=FORMAT + 1), ["format 3, this release reads format 2"]),
-        (lambda config: config.pop("format"), ["format None, this release reads format 2"]),
+        (lambda config: config.update(format=1), ["is a run of format 1, this release reads format 3"]),
+        (lambda config: config.update(format=FORMAT + 1), ["format 4, this release reads format 3"]),
+        (lambda config: config.pop("format"), ["format None, this release reads format 3"]),
     ],
 )
 def test_a_run_that_this_release_cannot_read_is_refused_in_one_line(
@@ -221,7 +221,7 @@ def test_a_run_that_this_release_cannot_read_is_refused_in_one_line(
 
 def test_a_run_of_this_release_says_its_format(run: Path) -> None:
     config = read_config_file(run / "config.json")
-    assert config["format"] == FORMAT == 2
+    assert config["format"] == FORMAT == 3
     assert config == json.loads((run / "config.json").read_text())  # nothing to complete
 
 

@@ -87,6 +87,18 @@ def test_pairs_that_are_not_rectified_turn_auto_into_consensus(tmp_path: Path) -
     ]  # fmt: skip
 
 
+def test_the_tolerance_is_an_axis_whatever_decides(tmp_path: Path) -> None:
+    axis = {"max_error_px": [0.5, 1, 3.0], "verdict": "cardinality"}
+    found = expand_grid([axis, axis | {"verdict": "score"}])
+    assert [(trial.verdict, trial.max_error_px) for trial in found] == [
+        (verdict, px) for verdict in ("cardinality", "score") for px in (0.5, 1.0, 3.0)
+    ]
+    assert _read(tmp_path, "[grid]\nmax_error_px = [2, 5]").trials[1].max_error_px == 5.0
+    for bad in ("0.4", "5.5", "nan", '"none"'):
+        with pytest.raises(ValueError, match="max_error_px"):
+            _read(tmp_path, f"[grid]\nmax_error_px = {bad}")
+
+
 def test_seeds_count_where_something_is_random() -> None:
     assert len(expand_grid([{"seed": [0, 1], "outlier_rate": 0.1}])) == 2
     assert len(expand_grid([{"seed": [0, 1], "noise_px": 0.1}])) == 2

@@ -207,3 +207,14 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)
     assert result.returncode == 0, result.stderr
     assert "10000 of 10000 units done, 0 now" in result.stdout
+
+
+def test_pairs_outside_of_the_domain_are_marked_in_the_rows_and_in_the_log(inputs: Inputs, tmp_path: Path) -> None:
+    """Without a warning on the screen of whoever runs many pairs."""
+    grid = {"detector": "fast", "score": "consensus", "outlier_rate": [0.0, 1.0], "max_error_px": [1.0, 3.0]}
+    run_sweep(SweepConfig(expand_grid([grid])), inputs.manifest, tmp_path / "run", num_workers=1, limit=1)
+    rows = read_results(tmp_path / "run").select("outlier_rate", "max_error_px", "domain").rows()
+    assert sorted(rows) == [(0, 1, ""), (0, 3, ""), (1, 1, "agreement"), (1, 3, "agreement")]
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    (marked,) = [line for line in lines if line["message"] == "outside of the domain"]
+    assert (marked["unit"], marked["scene"], marked["domain"]) == (0, "synthetic-00", ["agreement"])

@@ -18,7 +18,7 @@ def draw_overlay(
         pair: both views.
         matches: its M matches.
         inlier: (M,) bool, the verdict.
-        correct: (M,) bool, the disparity is right; ignored where ground truth is unknown.
+        correct: (M,) bool, disparity and row are right; ignored where ground truth is unknown.
         valid: (M,) bool, ground truth is known.
         caption: one line or two; pair, detector and settings.
 

@@ -47,6 +47,7 @@ SETTINGS = {
     "threshold": Setting("threshold"),
     "target_sensitivity": Setting("target sens."),
     "min_precision": Setting("min. precision"),
+    "max_error_px": Setting("max. error px"),
 }
 CELLS = ("true_positive", "false_positive", "true_negative", "false_negative")
 TOTALS = ("num_matches", "num_valid", "num_untested", *CELLS)

@@ -53,6 +53,7 @@ def run_counts(run: RunResults) -> dict[str, int]:
         "units": results["unit"].n_unique(),
         "trials": results["trial"].n_unique(),
         "rows": len(results),
+        "pairs outside of the domain": results.filter(pl.col("domain") != "").select("dataset", "scene").n_unique(),
         "failed units": run.errors["unit"].n_unique(),
     }
 

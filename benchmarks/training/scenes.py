@@ -1,7 +1,7 @@
 """The scenes that train and cross-validate the learned score; the paper's eight are not among them.
 
-Middlebury 2001, 2006 and MiddEval3 (quarter size), ETH3D and KITTI 2015; the rendered pairs of FlyingThings3D, Monkaa and
-TartanAir (Mayer et al. 2016, Wang et al. 2020); and this library's own renderings of many sizes.
+Middlebury 2001, 2006 and MiddEval3 (quarter size), ETH3D and KITTI 2015; the rendered pairs of FlyingThings3D, Monkaa
+and TartanAir (Mayer et al. 2016, Wang et al. 2020); and this library's own renderings of many sizes.
 """
 
 from __future__ import annotations

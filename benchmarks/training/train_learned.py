@@ -2,8 +2,8 @@
 
     python benchmarks/training/train_learned.py DATA TRAINING_DATA WORK weights.safetensors
 
-DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read. WORK receives
-the putatives of every scene and what the network sees of them (2 GB), and the weights and the figures of the
+DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read. WORK
+receives the putatives of every scene and what the network sees of them (3 GB), and the weights and the figures of the
 cross-validation. Everything follows from the seeds below; each training runs on one thread.
 """
 
@@ -42,8 +42,8 @@ from training.putatives import Putatives, find_putatives
 from training.scenes import NUM_FOLDS, Scene, list_scenes
 from training.work_folder import fold_weights, items_path, putatives_path
 
-SEED, EPOCHS, PAIRS_AT_ONCE = 0, 14, 8
-LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-3
+SEED, EPOCHS, PAIRS_AT_ONCE = 0, 30, 8
+LEARNING_RATE, WEIGHT_DECAY = 8e-3, 1e-3
 DROP_IMAGE, DROP_COST = 0.15, 0.30  # share of the pairs that are shown without
 BELIEF_WEIGHT = 0.2  # of the loss on the beliefs between rounds
 _TOLERANCES = torch.tensor(TOLERANCES_PX)
@@ -146,7 +146,7 @@ def train(items: Sequence[Item]) -> LearnedScore:
 
 
 def loss_of(network: LearnedScore, q: Quantities, known: Tensor, correct: Tensor) -> Tensor:
-    """Cross-entropy over all tolerances that the truth can judge; a pair weighs as the root of its number of matches."""
+    """Cross-entropy over all tolerances that the truth can judge; a pair weighs as the root of its matches' number."""
     judged = known.any(1)
     count = q.share.new_zeros(q.num_pairs).index_add(0, q.batch, judged.float())
     weight = count.clamp(min=1).rsqrt()[q.batch]
@@ -181,7 +181,7 @@ class LeftOut(NamedTuple):
 
 @torch.no_grad()
 def cross_validate(work: Path, scenes: Sequence[Scene], fold: int | None) -> tuple[dict[str, Tensor], list[LeftOut]]:
-    """Weights of a training without the scenes of a fold, or with all if it is None, and what they say of the others."""
+    """Weights of a training without the scenes of a fold, or with all if it is None; what they say of the others."""
     torch.set_num_threads(1)
     start = time.perf_counter()
     with torch.enable_grad():

@@ -13,53 +13,73 @@ from tensor_stereo.types import Matches
 
 _ALIGNING_PX = 2.0  # largest error of the disparity of matches that tell how the rows of a pair agree
 
-def matches_against_gt(
-    matches: Matches, disparity_gt: Tensor | Sequence[Tensor], *, max_error_px: float = 1.0
-) -> tuple[Tensor, Tensor]:
-    """Hold every match of rectified pairs against ground truth at the nearest pixel of its left keypoint.
 
-    A match is correct if its disparity is off by at most ``max_error_px``, and its row too. Rows count after the row
-    offset and slow drift that all matches of a pair share, which
-    :func:`tensor_stereo.scores.alignment.fit_alignment` finds on those whose disparity is right within 2 px, whatever
-    the tolerance, so that a larger one never loses a match; fewer than 12 such matches share none. Coordinates are rounded half to even; keypoints up to 1 px outside the image read the border. No
-    gradient.
+def errors_against_gt(matches: Matches, disparity_gt: Tensor | Sequence[Tensor]) -> Tensor:
+    """How far every match of rectified pairs is from ground truth at the nearest pixel of its left keypoint.
+
+    The error is the larger one of disparity and row. Rows count after the row offset and slow drift that all matches of
+    a pair share, which :func:`tensor_stereo.scores.alignment.fit_alignment` finds on those whose disparity is right
+    within 2 px; fewer than 12 such matches share none. Coordinates are rounded half to even; keypoints up to 1 px
+    outside the image read the border. No gradient.
 
     Args:
         matches: M matches of B pairs.
         disparity_gt: (B, H, W) floating point, or B maps (H_b, W_b) where sizes differ; x0 - x1 in px of view 0. NaN
             and infinite values are unknown; 0 is a disparity.
+
+    Returns:
+        (M,) float64 px of view 0, NaN where ground truth is unknown.
+
+    Raises:
+        ValueError: if there is not one map per pair, or a keypoint lies more than 1 px outside its image.
+        TypeError: if a map does not hold floating point values.
+
+    Source: the paper, section 4, which looks at the disparity alone.
+
+    Example:
+        >>> left = torch.tensor([[5.0, 0.0], [6.0, 0.0], [5.0, 2.0]])
+        >>> right = torch.tensor([[2.0, 0.0], [1.0, 0.0], [2.0, 3.5]])  # another disparity, another row
+        >>> matches = Matches(left, right, ptr=torch.tensor([0, 3]))
+        >>> errors_against_gt(matches, torch.full((1, 4, 8), 3.0))
+        tensor([0.0000, 2.0000, 1.5000], dtype=torch.float64)
+    """
+    for b, disparity in enumerate(disparity_gt):
+        if not disparity.is_floating_point():
+            raise TypeError(
+                f"disparity_gt of pair {b} must be floating point with NaN for unknown, got {disparity.dtype}"
+            )
+    truth = sample_nearest(disparity_gt, matches.keypoints0, matches.ptr, name="keypoints0").double()
+    # the difference of two float32 coordinates is exact in float64, so an error of just 1 px stays one
+    disparity, rows = (matches.keypoints0.detach().double() - matches.keypoints1.detach().double()).unbind(1)
+    error = torch.where(truth.isfinite(), (truth - disparity).abs(), torch.nan)
+    near = (error <= _ALIGNING_PX) & rows.isfinite()
+    shift = fit_alignment(matches, near).row_shift(matches.keypoints0, matches.ptr)
+    return torch.maximum(error, (rows + shift).abs())
+
+
+def matches_against_gt(
+    matches: Matches, disparity_gt: Tensor | Sequence[Tensor], *, max_error_px: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """Tell which matches of rectified pairs are correct: those whose error is at most ``max_error_px``.
+
+    Args:
+        matches: M matches of B pairs.
+        disparity_gt: as for :func:`errors_against_gt`, whose errors count.
         max_error_px: largest error of a correct match, in px of view 0; an error of just that is one.
 
     Returns:
         correct (M,) bool, False where ground truth is unknown, and valid (M,) bool, True where it is known.
 
     Raises:
-        ValueError: if there is not one map per pair, ``max_error_px`` is negative, or a keypoint lies more than 1 px
-            outside its image.
-        TypeError: if a map does not hold floating point values.
-
-    Source: the paper, section 4, which looks at the disparity alone.
+        ValueError: if ``max_error_px`` is negative, and as :func:`errors_against_gt`, like TypeError.
 
     Example:
-        >>> import torch
-        >>> left = torch.tensor([[5.0, 0.0], [6.0, 0.0], [5.0, 2.0]])
-        >>> right = torch.tensor([[2.0, 0.0], [1.0, 0.0], [2.0, 3.5]])  # another disparity, another row
-        >>> matches = Matches(left, right, ptr=torch.tensor([0, 3]))
+        >>> left, right = torch.tensor([[5.0, 0.0], [6.0, 0.0]]), torch.tensor([[2.0, 0.0], [1.0, 0.0]])
+        >>> matches = Matches(left, right, ptr=torch.tensor([0, 2]))
         >>> matches_against_gt(matches, torch.full((1, 4, 8), 3.0))
-        (tensor([ True, False, False]), tensor([True, True, True]))
+        (tensor([ True, False]), tensor([True, True]))
     """
     if not max_error_px >= 0:
         raise ValueError(f"max_error_px must not be negative, got {max_error_px}")
-    for b, disparity in enumerate(disparity_gt):
-        if not disparity.is_floating_point():
-            raise TypeError(
-                f"disparity_gt of pair {b} must be floating point with NaN for unknown, got {disparity.dtype}"
-            )
-    truth = sample_nearest(disparity_gt, matches.keypoints0, matches.ptr, name="keypoints0")
-    valid = truth.isfinite()
-    # the difference of two float32 coordinates is exact in float64, so an error of just 1 px stays one
-    disparity, rows = (matches.keypoints0.detach().double() - matches.keypoints1.detach().double()).unbind(1)
-    error = (truth - disparity).abs()
-    near = valid & (error <= _ALIGNING_PX) & rows.isfinite()
-    shift = fit_alignment(matches, near).row_shift(matches.keypoints0, matches.ptr)
-    return valid & (torch.maximum(error, (rows + shift).abs()) <= max_error_px), valid
+    error = errors_against_gt(matches, disparity_gt)
+    return error <= max_error_px, ~error.isnan()

@@ -1,8 +1,9 @@
 """Local image evidence for putative matches: does another place on the row explain the window better?
 
 Windows around both keypoints of a match are held against the row of the other view, over a range of disparities that
-follows from the matches themselves. The measure is the logarithm of the zero-mean sum of squared differences: but for a
-constant, the negative log-likelihood per degree of freedom of Gaussian noise of unknown variance.
+follows from the matches themselves, and near the match once more along the slope of its surface. The measure is the
+logarithm of the zero-mean sum of squared differences: but for a constant, the negative log-likelihood per degree of
+freedom of Gaussian noise of unknown variance.
 """
 
 from __future__ import annotations
@@ -14,49 +15,64 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from tensor_stereo.features import list_images, to_gray
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.scores.alignment import Alignment, align_matches
+from tensor_stereo.scores.slopes import estimate_slopes
+from tensor_stereo.scores.windows import (
+    LIKE,
+    MIDDLE,
+    NUM_HALVES,
+    NUM_WHOLE,
+    RADIUS_PX,
+    TIGHT,
+    compare_windows,
+    lowest_place,
+    sample_slanted,
+    sample_strips,
+    sample_windows,
+    window_kernels,
+)
 from tensor_stereo.types import Matches
 
 MAX_DISPARITIES = 256  # of one pair's search range
-_RADIUS_PX = 7  # of the largest window
 _NEAR_PX = 3  # disparities on either side of the match that are looked at one by one
 _SAME_PX = 2  # a rival is farther from the match than that
-_SLOPE_GAP_PX, _STEEPEST, _SLOPE_REACH_PX, _SLOPE_RIDGE, _SLOPE_MISS_PX = 2.0, 0.5, 40.0, 40.0, 1.0
-_NOISE_VARIANCE = 2.0  # grey levels squared; keeps windows without texture from deciding
 _NOWHERE = 20.0  # log SSD of a place outside of the image
 _TIE = 1e-3  # log SSDs that near are alike; rounding must not choose between them
 _MAX_LOG = 6.0  # log ratios of SSDs are cut there
-_LIKENESS_LEVELS, _LIKENESS_PX2 = 12.0, 40.0  # fall-off of the weights of pixels unlike the centre
 _ROWS_AT_ONCE = 192  # matches whose windows stay in the cache
-_TIGHT_LEVELS, _TIGHT_PX2 = 10.0, 8.0  # the same around the pixel of the keypoint itself
-_WHOLE, _HALF = 4, 4  # whole windows, which are also held against the row, and half windows
-_TIGHT = 3  # whose mean counts as well
-_CURVES = 6  # the windows of pixels like the centre, and the half windows
-_PLACES = 2 * _NEAR_PX + 1
-_SLANTED = (1, 2)  # the whole windows that are also compared along the slope of the surface
-_SLANTED_VALUES = len(_SLANTED) * (_PLACES + 3)
-NUM_VALUES = 2 * (_WHOLE * (_PLACES + 7) + 2 * _HALF + 1 + _SLANTED_VALUES) + 2
+_SLANTED = (MIDDLE, LIKE)  # the windows that are also compared along the slope of the surface
+_CURVES = (LIKE, TIGHT)  # those whose curve along the row is kept, for the disparities of the neighbours
+NUM_CURVES = len(_CURVES)
+_NUM_PLACES = 2 * _NEAR_PX + 1
+NUM_VALUES = 2 * (NUM_WHOLE * (_NUM_PLACES + 7) + 2 * NUM_HALVES + 1 + len(_SLANTED) * (_NUM_PLACES + 3)) + 2
 
 
 class ImageEvidence(NamedTuple):
     """What the images say about M matches.
 
-    Windows have 15 x 15 px: 5 x 5 and 11 x 11 boxes, pixels like the centre, and four halves of 11 x 11.
+    Windows have 15 x 15 px: 5 x 5 and 11 x 11 boxes, pixels like the centre, in a wide and in a tight window, and four
+    halves of 11 x 11.
 
     Attributes:
         values: (M, :data:`NUM_VALUES`) float32. For the windows of view 0, then of view 1: log SSD at the 7 places
             around the match, less its minimum; log SSD and correlation at the match; by how much the best rival on the
             row is worse in both; share of rivals that are about as good or better; log distance of a better rival; log
-            SSD of half windows, and by how much it is above its minimum; log variance and gradient. At last the
-            difference of the grey levels, and how far the disparity lies outside of the search range.
-        curve0: (M, D) float32, log SSD of the window in view 0 along the row of view 1, less that of the match, over
-            pixels like the centre, between -6 and 6; column k stands for disparity ``first + k`` px.
-        curve1: (M, D) float32, the same for the window in view 1 along the row of view 0.
+            SSD of half windows, and by how much it is above its minimum; log variance and gradient; for windows along
+            the slope of the surface log SSD at the 7 places, less its minimum, by how much it is lower than without
+            slope, correlation, and where it is lowest. At last the difference of the grey levels, and how far the
+            disparity lies outside of the search range.
+        curve0: (M, 2, D) float32, log SSD of two windows in view 0 along the row of view 1, less that of the match,
+            over pixels like the centre, in a wide and in a tight window, between -6 and 6; column k stands for
+            disparity ``first + k`` px.
+        curve1: (M, 2, D) float32, the same for the windows in view 1 along the row of view 0.
         first: (M,) float32 px.
         num_columns: (M,) int64 columns that the pair has; 0 without images.
+        offset: (M,) float32 px, from the disparity of the match to the one nearby, at most 4 px away, that the windows
+            of both views favour, to parts of a px.
     """
 
     values: Tensor
@@ -97,14 +113,14 @@ def measure_images(
         >>> points = torch.tensor([[9.0, 9.0], [20.0, 9.0], [9.0, 20.0]])
         >>> matches = Matches(points, points, torch.tensor([0, 3]))
         >>> measure_images([image], [image], matches, build_match_graphs(matches)).curve0.shape
-        torch.Size([3, 9])
+        torch.Size([3, 2, 9])
     """
     views = [
         list_images(name, images, matches.num_pairs) for name, images in (("images0", images0), ("images1", images1))
     ]
     check_match_graphs(matches, graphs)
     ranges = search_ranges(matches if alignment is None else align_matches(matches, alignment), graphs)
-    slope = local_slopes(matches, graphs)
+    slope = estimate_slopes(matches, graphs)
     row_shift = matches.keypoints0.new_zeros(matches.num_matches).float()
     if alignment is not None:
         row_shift = alignment.row_shift(matches.keypoints0, matches.ptr).float()
@@ -113,7 +129,7 @@ def measure_images(
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
         for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
             gray = [to_gray(images[b][None])[0, 0].float() for images in views]
-            gray[1] = gray[1] - _brighter(gray, matches, start, stop)
+            gray[1] = gray[1] - _brighter(gray, *(k[start:stop] for k in (matches.keypoints0, matches.keypoints1)))
             for row in range(start, stop, _ROWS_AT_ONCE):
                 rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
                 points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
@@ -164,44 +180,58 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
     return ranges
 
 
-def _brighter(gray: Sequence[Tensor], matches: Matches, start: int, stop: int) -> Tensor:
+def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> Tensor:
     """() by how many grey levels view 1 is brighter, the median over the matches of a pair."""
-    if start == stop:
+    if not len(points0):
         return gray[0].new_zeros(())
     levels = []
-    for image, points in zip(gray, (matches.keypoints0, matches.keypoints1), strict=True):
-        smooth = torch.nn.functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
-        x, y = points[start:stop].round().long().unbind(1)
+    for image, points in zip(gray, (points0, points1), strict=True):
+        smooth = functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
+        x, y = points.round().long().unbind(1)
         levels.append(smooth[y.clamp(0, image.shape[0] - 1), x.clamp(0, image.shape[1] - 1)])
     return (levels[1] - levels[0]).median()
 
 
 def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
     none = torch.zeros(0, dtype=torch.float32, device=like.device)
-    return none.reshape(0, NUM_VALUES), *(none.reshape(0, _CURVES, width),) * 2, none
+    curve = none.reshape(0, NUM_CURVES, width)
+    return none.reshape(0, NUM_VALUES), curve, curve, none
+
+
+class _Found(NamedTuple):
+    """What the windows of one view say about m matches."""
+
+    columns: list[Tensor]
+    curve: Tensor  # (m, 2, D)
+    offset: Tensor  # (m,)
 
 
 def _measure_both(
-    gray: Sequence[Tensor], points: Sequence[Tensor], row_shift: Tensor, slope: Tensor, first: int, count: int, width: int
+    gray: Sequence[Tensor],
+    points: Sequence[Tensor],
+    row_shift: Tensor,
+    slope: Tensor,
+    first: int,
+    count: int,
+    width: int,
 ) -> tuple[Tensor, ...]:
-    """Values and both curves of m matches of one pair."""
+    """Values, both curves and the offset of m matches of one pair."""
     own = (points[0][:, 0] - points[1][:, 0] - first).round()  # column of the match
-    columns, curves, levels, offsets = [], [], [], []
-    rate = 1 / (1 - slope[:, :1])  # of view 1 against view 0
-    for view in (0, 1):
-        windows = _sample(gray[view], points[view], _RADIUS_PX)
-        row = points[view][:, 1] + (-row_shift if view else row_shift)  # in the other view
-        shear = slope * rate if view else -slope
-        side, curve, offset = _measure_one(
-            gray[1 - view], windows, points[view], row, points[1 - view], own, first, count, view, shear
+    windows = [sample_windows(gray[view], points[view], RADIUS_PX) for view in (0, 1)]
+    rows = points[0][:, 1] + row_shift, points[1][:, 1] - row_shift  # in the other view
+    shears = -slope, slope / (1 - slope[:, :1])
+    found = [
+        _measure_one(
+            gray[1 - v], windows[v], points[v], rows[v], points[1 - v], shears[v], own, first, count, reverse=not v
         )
-        offsets.append(offset)
-        columns += side
-        curves.append(torch.nn.functional.pad(curve, (0, width - count)))
-        levels.append(windows[:, 4:-4, 4:-4].mean((1, 2)))
+        for v in (0, 1)
+    ]
+    levels = [window[:, 4:-4, 4:-4].mean((1, 2)) for window in windows]
     brighter = (levels[0] - levels[1]).abs() / 16
     beyond = torch.log1p((-own).clamp(min=0) + (own - count + 1).clamp(min=0)).clamp(max=5)
-    return torch.cat([*columns, brighter[:, None], beyond[:, None]], 1), *curves, sum(offsets) / 2
+    values = torch.cat([*found[0].columns, *found[1].columns, brighter[:, None], beyond[:, None]], 1)
+    curves = (functional.pad(one.curve, (0, width - count)) for one in found)
+    return values, *curves, (found[0].offset + found[1].offset) / 2
 
 
 def _measure_one(
@@ -210,34 +240,32 @@ def _measure_one(
     points: Tensor,
     row: Tensor,
     partners: Tensor,
+    shear: Tensor,
     own: Tensor,
     first: int,
     count: int,
-    view: int,
-    shear: Tensor,
-) -> tuple[list[Tensor], Tensor, Tensor]:
-    """Values of the windows of one view, held against the image of the other, and their curve."""
-    kernels = _window_kernels(windows)
-    near = _sample(other, partners, _RADIUS_PX + _NEAR_PX)
-    cost, likeness, variance = _compare(windows, near, kernels)
-    if not view:  # disparity grows against the columns of view 1
-        cost, likeness = cost.flip(1), likeness.flip(1)
+    *,
+    reverse: bool,
+) -> _Found:
+    """What the windows of one view say; ``reverse``: disparity grows against the columns of the other view."""
+    kernels = window_kernels(windows)
+    whole = slice(0, NUM_WHOLE)
+
+    def compare(strips: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        cost, likeness, variance = compare_windows(windows, strips, kernels)
+        return (cost.flip(1), likeness.flip(1), variance) if reverse else (cost, likeness, variance)
+
+    cost, likeness, variance = compare(sample_windows(other, partners, RADIUS_PX + _NEAR_PX), kernels)
     mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
-    slanted = _sample_slanted(other, partners, shear)
-    along, along_likeness, _ = _compare(windows, slanted, kernels[..., list(_SLANTED)])
-    if not view:
-        along, along_likeness = along.flip(1), along_likeness.flip(1)
-    offset = _lowest_place(along.exp())
+    slanted = sample_slanted(other, partners, RADIUS_PX + _NEAR_PX, shear)
+    along, along_likeness, _ = compare(slanted, kernels[..., list(_SLANTED)])
+    offset = lowest_place(along) * (1 + shear[:, :1])  # whose places are that far apart
     # the row of the window itself, but for the alignment: there lies a rectified partner
-    toward = 1 if view else -1  # way of growing disparity in the other view
+    toward = -1 if reverse else 1
     x = points[:, :1] + toward * (first + torch.arange(count, device=points.device))  # (m, D)
     left = x.amin(1) if count else points[:, 0]
-    strip = _sample_strip(other, left - _RADIUS_PX, row, count + 2 * _RADIUS_PX)
-    far, far_likeness, _ = _compare(windows, strip, kernels)
-    if not view:
-        far, far_likeness = far.flip(1), far_likeness.flip(1)
-    curve = (far[..., -_CURVES:] - mid[:, None, -_CURVES:]).clamp(-_MAX_LOG, _MAX_LOG)
-    far, far_likeness = far[..., :_WHOLE], far_likeness[..., :_WHOLE]
+    strips = sample_strips(other, left - RADIUS_PX, row, count + 2 * RADIUS_PX)
+    far, far_likeness, _ = compare(strips, kernels[..., whole])
     outside = ((x < 0) | (x > other.shape[1] - 1))[..., None]
     far, far_likeness = far.masked_fill(outside, _NOWHERE), far_likeness.masked_fill(outside, -1.0)
     place = torch.arange(count, device=own.device)
@@ -247,138 +275,25 @@ def _measure_one(
     rival = others.amin(1)
     away = (place - own[:, None]).abs()[..., None].expand_as(others)  # of equal rivals the nearest counts
     nearest = away.masked_fill(others > rival[:, None] + _TIE, 100).amin(1)
-    whole, whole_likeness = mid[:, :_WHOLE], likeness[:, _NEAR_PX, :_WHOLE]
-    margin = (rival - whole).clamp(-_MAX_LOG, _MAX_LOG).masked_fill(alone, 0)
-    margin_likeness = (whole_likeness - far_likeness.masked_fill(same, -1.0).amax(1)).masked_fill(alone, 0)
-    crowd = (~same & (far < whole[:, None] + 0.3)).float().mean(1)
-    distance = torch.log1p(nearest.clamp(max=100)).masked_fill(margin >= -_TIE, 0)
-    gradient = torch.log1p(windows.diff(dim=2)[:, 3:-3, 3:-3].square().mean((1, 2)))
+    here, here_likeness = mid[:, whole], likeness[:, _NEAR_PX, whole]
+    margin = (rival - here).clamp(-_MAX_LOG, _MAX_LOG).masked_fill(alone, 0)
+    margin_likeness = (here_likeness - far_likeness.masked_fill(same, -1.0).amax(1)).masked_fill(alone, 0)
     columns = [
-        (cost - lowest[:, None])[..., :_WHOLE].flatten(1),
-        whole,
-        whole_likeness,
+        (cost - lowest[:, None])[..., whole].flatten(1),
+        here,
+        here_likeness,
         margin,
         margin_likeness,
-        crowd,
-        distance,
-        mid[:, _WHOLE:],
-        (mid - lowest)[:, _WHOLE:],
-        variance[:, :_WHOLE],
-        gradient[:, None],
+        (~same & (far < here[:, None] + 0.3)).float().mean(1),
+        torch.log1p(nearest.clamp(max=100)).masked_fill(margin >= -_TIE, 0),
+        mid[:, NUM_WHOLE:],
+        (mid - lowest)[:, NUM_WHOLE:],
+        variance[:, whole],
+        torch.log1p(windows.diff(dim=2)[:, 3:-3, 3:-3].square().mean((1, 2)))[:, None],
         (along - along.amin(1, keepdim=True)).flatten(1),
         along[:, _NEAR_PX] - mid[:, list(_SLANTED)],
         along_likeness[:, _NEAR_PX],
         offset,
     ]
-    return columns, curve.transpose(1, 2), offset[:, -1]
-
-
-def _lowest_place(cost: Tensor) -> Tensor:
-    """(m, K) px from the middle place to the lowest, by the parabola through it and both beside it."""
-    k = cost.argmin(1, keepdim=True).clamp(1, _PLACES - 2)
-    before, least, after = (cost.gather(1, k + step)[:, 0] for step in (-1, 0, 1))
-    bend = (before - 2 * least + after).clamp(min=1e-3)
-    return (k[:, 0] - _NEAR_PX) + ((before - after) / (2 * bend)).clamp(-1, 1)
-
-
-def _sample_slanted(image: Tensor, centers: Tensor, shear: Tensor) -> Tensor:
-    """(m, 15, 21) grey levels around sub-pixel centres, with columns moved by the shear of the place; bilinear."""
-    height, width = image.shape
-    v = torch.arange(-_RADIUS_PX, _RADIUS_PX + 1, device=image.device, dtype=torch.float32)[:, None]
-    reach = _RADIUS_PX + _NEAR_PX
-    u = torch.arange(-reach, reach + 1, device=image.device, dtype=torch.float32)
-    x = (centers[:, 0, None, None] + u + shear[:, 0, None, None] * u + shear[:, 1, None, None] * v).clamp(0, width - 1)
-    y = (centers[:, 1, None, None] + v).clamp(0, height - 1)
-    x0, y0 = x.floor(), y.floor()
-    fx, fy = x - x0, y - y0
-    left, top = x0.long(), y0.long()
-    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
-    flat = image.reshape(-1)
-    rows = [flat[row * width + left] * (1 - fx) + flat[row * width + right] * fx for row in (top, bottom)]
-    return rows[0] + fy * (rows[1] - rows[0])
-
-
-def local_slopes(matches: Matches, graphs: MatchGraphs) -> Tensor:
-    """(M, 2) float32 px/px, how the disparity changes with x and y of view 0 around every match."""
-    x, y = matches.keypoints0.double().unbind(1)
-    disparity = matches.disparity.double()
-    ends = [torch.cat([getattr(a, name) for a in (graphs.adjacency0, graphs.adjacency1)]) for name in ("row_indices", "col_indices")]
-    dx, dy, gap = (values[ends[1]] - values[ends[0]] for values in (x, y, disparity))
-    length = (dx * dx + dy * dy).sqrt()
-    weight = (gap.abs() <= (_SLOPE_GAP_PX + _STEEPEST * length)).double() / (1 + (gap / (1 + 0.2 * length)) ** 2)
-    a = b = torch.zeros_like(x)
-    near = 1 / (1 + (length / _SLOPE_REACH_PX) ** 2)
-    for _ in range(4):
-        wx, wy = weight * near * dx, weight * near * dy
-        xx, xy, yy, gx, gy = (
-            torch.zeros_like(x).index_add(0, ends[0], column)
-            for column in (wx * dx, wx * dy, wy * dy, wx * gap, wy * gap)
-        )
-        xx, yy = xx + _SLOPE_RIDGE, yy + _SLOPE_RIDGE
-        determinant = xx * yy - xy * xy
-        a, b = (gx * yy - gy * xy) / determinant, (gy * xx - gx * xy) / determinant
-        miss = gap - a[ends[0]] * dx - b[ends[0]] * dy
-        weight = 1 / (1 + (miss / _SLOPE_MISS_PX).square()).square()
-    return torch.stack([a, b], 1).clamp(-_STEEPEST, _STEEPEST).float()
-
-
-def _sample(image: Tensor, centers: Tensor, radius_x: int) -> Tensor:
-    """(m, 15, 2 rx + 1) grey levels around sub-pixel centres."""
-    return _sample_strip(image, centers[:, 0] - radius_x, centers[:, 1], 2 * radius_x + 1)
-
-
-def _sample_strip(image: Tensor, left: Tensor, center_y: Tensor, width: int) -> Tensor:
-    """(m, 15, width) grey levels of strips that begin at x = ``left``; bilinear, the border repeated."""
-    height, num_columns = image.shape
-    left = left.clamp(-2.0 * width, num_columns + 2.0 * width)
-    center_y = center_y.clamp(-2.0 * _RADIUS_PX, height + 2.0 * _RADIUS_PX)
-    x0, y0 = left.floor(), center_y.floor()
-    fx, fy = (left - x0)[:, None, None], (center_y - y0)[:, None, None]
-    rows = torch.arange(-_RADIUS_PX, _RADIUS_PX + 2, device=image.device)
-    x = (x0.long()[:, None] + torch.arange(width + 1, device=image.device)).clamp(0, num_columns - 1)
-    y = (y0.long()[:, None] + rows).clamp(0, height - 1)
-    levels = image.reshape(-1)[y[:, :, None] * num_columns + x[:, None]]
-    levels = levels[:, :-1] + fy * (levels[:, 1:] - levels[:, :-1])
-    return levels[..., :-1] + fx * (levels[..., 1:] - levels[..., :-1])
-
-
-def _window_kernels(windows: Tensor) -> Tensor:
-    """(m, 225, 7) weights with sum 1: 5x5, 11x11, pixels like the centre (Yoon & Kweon 2006), four half windows."""
-    side = windows.shape[1]
-    r = torch.arange(side, device=windows.device) - _RADIUS_PX
-    y, x = r[:, None].expand(side, side), r.expand(side, side)
-    middle = (x.abs() <= 5) & (y.abs() <= 5)
-    small = (x.abs() <= 2) & (y.abs() <= 2)
-    halves = [middle & (x <= 1), middle & (x >= -1), middle & (y <= 1), middle & (y >= -1)]
-    boxes = torch.stack([small, middle, *halves]).float().expand(len(windows), -1, -1, -1)
-    center = windows[:, _RADIUS_PX - 1 : _RADIUS_PX + 2, _RADIUS_PX - 1 : _RADIUS_PX + 2].mean((1, 2))
-    unlike = (windows - center[:, None, None]).abs() / _LIKENESS_LEVELS
-    far = (x.square() + y.square()).float()
-    similar = torch.exp(-unlike - far / _LIKENESS_PX2)[:, None] + 1e-4
-    unlike = (windows - windows[:, _RADIUS_PX, _RADIUS_PX, None, None]).abs() / _TIGHT_LEVELS
-    tight = torch.exp(-unlike - far / _TIGHT_PX2)[:, None] + 1e-5
-    weights = torch.cat([boxes[:, :2], similar, tight, boxes[:, 2:]], 1).flatten(2)
-    return (weights / weights.sum(2, keepdim=True)).transpose(1, 2)
-
-
-def _compare(windows: Tensor, strips: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Log zero-mean SSD (m, D, K), correlation (m, D, K), and log variance of the windows (m, K).
-
-    ``strips`` is (m, 15, D + 14): D windows, each one column on.
-    """
-    side, k = windows.shape[1], kernels.shape[2]
-    level = windows.mean((1, 2))[:, None, None]  # near zero the squares keep their digits
-    anchor = (windows - level).flatten(1)[..., None]
-    moving = (strips - level).unfold(2, side, 1).transpose(1, 2).reshape(len(strips), -1, side * side)
-    sums = moving @ torch.cat([kernels, kernels * anchor], 2)
-    squares = moving.square_() @ kernels
-    mean, product = sums[..., :k], sums[..., k:]
-    anchor_mean = (kernels * anchor).sum(1)
-    anchor_variance = ((kernels * anchor.square()).sum(1) - anchor_mean.square()).clamp(min=0)
-    variance = (squares - mean.square()).clamp(min=0)
-    covariance = product - mean * anchor_mean[:, None]
-    difference = (variance + anchor_variance[:, None] - 2 * covariance).clamp(min=0)
-    if k > _TIGHT:
-        difference[..., _TIGHT] += (mean - anchor_mean[:, None])[..., _TIGHT].square()
-    scale = (variance + _NOISE_VARIANCE) * (anchor_variance[:, None] + _NOISE_VARIANCE)
-    return torch.log(difference + _NOISE_VARIANCE), covariance / scale.sqrt(), torch.log(anchor_variance + 1)
+    curve = (far - here[:, None])[..., list(_CURVES)].clamp(-_MAX_LOG, _MAX_LOG)
+    return _Found(columns, curve.transpose(1, 2), offset.mean(1))

@@ -3,7 +3,8 @@
 Every match starts from its own quantities and, where there are images, from what these say about it. In each of three
 rounds it hears from its neighbours in either view, through what lies between both; in the last it also looks at the
 plane through the neighbours that are believed so far. Costs and images may be missing: training has left them out at
-random, and without them the network adds nothing in their place.
+random, and without them the network adds nothing in their place. It says how likely the error stays within each of five
+tolerances.
 """
 
 from __future__ import annotations
@@ -30,20 +31,14 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
-from tensor_stereo.scores.tolerance import NUM_TOLERANCES, TOLERANCES_PX, probability_within, rising
+from tensor_stereo.scores.planes import NUM_PLANE, plane_columns
+from tensor_stereo.scores.tolerance import NUM_TOLERANCES, probability_within, rising
 from tensor_stereo.types import Adjacency, Matches
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
 _MATCHES_AT_ONCE = 8192  # whose edges stay in the cache, and are enough for two threads
 _WIDTH, _EDGE_WIDTH, _ROUNDS = 24, 12, 3
-_NUM_PLANE = 9 + NUM_TOLERANCES
-import os
-PLANE_FROM = int(os.environ.get("PF", 1))
-_NUM_PREDICTED = NUM_TOLERANCES + 2
-_SOFTNESS = 0.15  # of a tolerance
 _MAX_NORMALIZED = 4.0  # standard deviations
-_RIDGE = 0.3  # squared mean distances to neighbours; flattens planes that too few neighbours hold
-_MAX_GAP_PX = 64.0
 
 
 class LearnedScore(nn.Module):
@@ -65,7 +60,7 @@ class LearnedScore(nn.Module):
         self.enter = nn.Linear(NUM_NODE + NUM_COST + 2, width)
         self.enter_image = nn.Sequential(nn.Linear(NUM_VALUES, width), nn.ReLU(), nn.Linear(width, width, bias=False))
         self.enter_out = nn.Linear(width, width)
-        self.rounds = nn.ModuleList(MessageRound(width, edge_width, plane=k > PLANE_FROM) for k in range(num_rounds))
+        self.rounds = nn.ModuleList(MessageRound(width, edge_width, plane=k > 1) for k in range(num_rounds))
         self.head = nn.Linear(width, width)
         self.last = nn.Linear(width, NUM_TOLERANCES)
         self.head_whole = nn.Linear(width, width, bias=False)
@@ -152,8 +147,8 @@ class MessageRound(nn.Module):
         self.edge_image = nn.Linear(NUM_EDGE_IMAGE, edge_width, bias=False)
         self.belief = nn.Linear(width, 1)
         self.plane = plane
-        self.predicted = nn.Linear(_NUM_PREDICTED, edge_width, bias=False) if plane else None
-        self.mix = nn.Linear(width + edge_width + 2 * _NUM_PLANE * plane, width)
+        self.mix = nn.Linear(width + edge_width + NUM_PLANE * plane, width)
+        self.mix_refined = nn.Linear(NUM_PLANE, width, bias=False) if plane else None
         self.whole = nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
         self.norm = nn.LayerNorm(width)
@@ -165,19 +160,14 @@ class MessageRound(nn.Module):
         (hear_i, tell_i), (hear_j, tell_j) = (ends.index_select(0, rows).chunk(2, 1) for rows in (q.i, q.j))
         to_i, to_j = (between + hear_i).add_(tell_j).add_(odd), (between + hear_j).add_(tell_i).sub_(odd)
         belief = self.belief(state)
-        if self.predicted is not None:
-            miss_i, miss_j = _predict(torch.sigmoid(belief), q)
-            to_i, to_j = to_i.add_(self.predicted(miss_i)), to_j.add_(self.predicted(miss_j))
         if with_image:
             to_i, to_j = to_i.add_(self.edge_image(q.image_i)), to_j.add_(self.edge_image(q.image_j))
         heard = q.receivers.sum(to_i.relu_(), to_j.relu_()) / q.degree
-        known = [state, heard]
-        if self.plane:
-            trust = torch.sigmoid(belief)
-            known.append(_plane_residual(trust, q, q.disparity))
-            known.append(_plane_residual(trust, q, q.refined) * q.has_image if with_image else torch.zeros_like(known[-1]))
-        whole = self.whole(_pair_mean(state, q)).index_select(0, q.batch)
-        mixed = self.mix(torch.cat(known, 1)) + whole
+        trust = torch.sigmoid(belief)
+        known = [state, heard, plane_columns(trust, q, q.disparity)] if self.plane else [state, heard]
+        mixed = self.mix(torch.cat(known, 1)) + self.whole(_pair_mean(state, q)).index_select(0, q.batch)
+        if self.mix_refined is not None and with_image:
+            mixed = mixed + self.mix_refined(plane_columns(trust, q, q.refined) * q.has_image)
         return self.norm(state + self.out(mixed.relu())), belief[:, 0]
 
 
@@ -193,62 +183,6 @@ def _cumulative(outputs: Tensor) -> Tensor:
 def _pair_mean(state: Tensor, q: Quantities) -> Tensor:
     """(B, K) means over the matches of each pair."""
     return state.new_zeros(q.num_pairs, state.shape[1]).index_add(0, q.batch, state * q.share)
-
-
-def _predict(trust: Tensor, q: Quantities) -> tuple[Tensor, Tensor]:
-    """(U, K) how far the planes of the neighbours miss the disparity of either end."""
-    x, y = q.step.clamp(-4, 4).unbind(1)
-    trust = trust[:, 0]
-    gap = (q.refined.index_select(0, q.j) - q.refined.index_select(0, q.i)).clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
-    alike = torch.exp(-gap.abs() / (1 + (x * x + y * y).sqrt()) / 1.0)
-    shared = torch.stack([torch.ones_like(x), x * x, x * y, y * y, gap * x, gap * y])
-    odd = torch.stack([x, y, gap])
-    to_i = torch.cat([shared, odd]) * (trust.index_select(0, q.j) * alike)
-    to_j = torch.cat([shared, -odd]) * (trust.index_select(0, q.i) * alike)
-    n, xx, xy, yy, rx, ry, sx, sy, r0 = q.receivers.sum(to_i.t(), to_j.t()).unbind(1)
-    n, xx, yy = n + trust + 0.1, xx + _RIDGE, yy + _RIDGE  # the match itself counts too
-    c00, c01, c02 = xx * yy - xy * xy, xy * sy - sx * yy, sx * xy - xx * sy
-    c11, c12, c22 = n * yy - sy * sy, sx * sy - n * xy, n * xx - sx * sx
-    determinant = (n * c00 + sx * c01 + sy * c02).clamp(min=1e-4)
-    z = q.refined + (c00 * r0 + c01 * rx + c02 * ry) / determinant
-    a = (c01 * r0 + c11 * rx + c12 * ry) / determinant
-    b = (c02 * r0 + c12 * rx + c22 * ry) / determinant
-    misses = []
-    for near, far, way in ((q.i, q.j, -1), (q.j, q.i, 1)):
-        guess = z.index_select(0, far) + way * (a.index_select(0, far) * x + b.index_select(0, far) * y)
-        miss = (guess - q.disparity.index_select(0, near)).abs()
-        misses.append(torch.stack([*_within(miss), torch.log1p(miss), torch.exp(-miss / 0.3)], 1))
-    return misses[0], misses[1]
-
-
-def _within(miss: Tensor) -> list[Tensor]:
-    """For every tolerance, (M,) whether a miss is smaller, softly."""
-    return [torch.sigmoid((1 - miss / t) / _SOFTNESS) for t in TOLERANCES_PX]
-
-
-def _plane_residual(weight: Tensor, q: Quantities, other: Tensor) -> Tensor:
-    """(M, 9) how far each disparity is from the plane, and from the mean, through those of the weighted neighbours."""
-    x, y = q.step.clamp(-4, 4).unbind(1)
-    gap_i, gap_j = (
-        (other.index_select(0, far) - q.disparity.index_select(0, near)).clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
-        for near, far in ((q.i, q.j), (q.j, q.i))
-    )
-    shared = torch.stack([torch.ones_like(x), x * x, x * y, y * y])
-    weight = weight[:, 0]
-    to_i = torch.cat([shared, torch.stack([x, y, gap_i * x, gap_i * y, gap_i])]) * weight.index_select(0, q.j)
-    to_j = torch.cat([shared, torch.stack([-x, -y, -gap_j * x, -gap_j * y, gap_j])]) * weight.index_select(0, q.i)
-    total, xx, xy, yy, sx, sy, gx, gy, sg = q.receivers.sum(to_i.t(), to_j.t()).unbind(1)
-    safe = total + 0.01
-    mean_x, mean_y, mean_gap = sx / safe, sy / safe, sg / safe
-    xx, yy = xx - total * mean_x * mean_x + _RIDGE, yy - total * mean_y * mean_y + _RIDGE
-    xy = xy - total * mean_x * mean_y
-    gx, gy = gx - total * mean_gap * mean_x, gy - total * mean_gap * mean_y
-    determinant = (xx * yy - xy * xy).clamp(min=1e-3)
-    slope_x, slope_y = (gx * yy - gy * xy) / determinant, (gy * xx - gx * xy) / determinant
-    columns = _within((mean_gap - slope_x * mean_x - slope_y * mean_y).abs())
-    for residual in ((mean_gap - slope_x * mean_x - slope_y * mean_y).abs(), mean_gap.abs()):
-        columns += [torch.exp(-residual / scale_px) for scale_px in (0.7, 2, 6)] + [torch.log1p(residual)]
-    return torch.stack([*columns, torch.log1p(total)], 1)
 
 
 @cache

@@ -16,10 +16,11 @@ from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.relations import shared_neighbors
 from tensor_stereo.scores.alignment import Alignment, align_matches
-from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
+from tensor_stereo.scores.image_evidence import NUM_CURVES, NUM_VALUES, ImageEvidence
 from tensor_stereo.types import Adjacency, Matches
 
-NUM_NODE, NUM_COST, NUM_EDGE, NUM_ODD, NUM_EDGE_IMAGE = 8, 2, 15, 2, 13
+NUM_NODE, NUM_COST, NUM_EDGE, NUM_ODD, NUM_REFINED = 8, 2, 15, 2, 4
+NUM_EDGE_IMAGE = 2 * NUM_CURVES + 1 + NUM_REFINED
 _TINY_PX2 = 1e-6  # added to squared lengths, so that their roots have a gradient at coincident points
 
 
@@ -100,7 +101,7 @@ def measure_quantities(
         >>> points = torch.tensor([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])
         >>> matches = Matches(points, points, torch.tensor([0, 3]))
         >>> measure_quantities(matches, build_match_graphs(matches)).edges.shape
-        torch.Size([3, 14])
+        torch.Size([3, 15])
     """
     check_fit(matches, graphs, evidence)
     batch = ptr_to_batch(matches.ptr)
@@ -119,23 +120,17 @@ def measure_quantities(
     edges, odd, step, length = _edge_quantities(torch.cat(points, 1), i, j, in0, in1)
     mean_length = (receivers.sum(length[:, None], length[:, None])[:, 0] / degree).clamp(min=1e-3)
     step = 2 * step / (mean_length.index_select(0, i) + mean_length.index_select(0, j))
+    refined = centered = _center(disparity, matches.num_pairs, batch, share)[:, 0]
     if evidence is None:
         image, has_image = nodes.new_zeros(len(nodes), NUM_VALUES), nodes.new_zeros(len(nodes), 1)
         image_i = image_j = edges.new_zeros(len(i), NUM_EDGE_IMAGE)
     else:
         image, has_image = evidence.values, (evidence.num_columns > 0)[:, None].float()
-        image_i, image_j = (
-            _look_up(evidence, disparity.detach()[:, 0], *ends, way)
-            for ends, way in (((i, j), step.detach()), ((j, i), -step.detach()))
-        )
-    centered = _center(disparity, matches.num_pairs, batch, share)[:, 0]
-    refined = centered
-    if evidence is not None:
         refined = centered + evidence.offset
-        gap = (refined.index_select(0, j) - refined.index_select(0, i)).detach()
-        plain = (centered.index_select(0, j) - centered.index_select(0, i)).detach()
-        extra = torch.stack([torch.exp(gap.abs() / -0.3), torch.exp(-gap.abs()), torch.log1p(gap.abs()), torch.exp((gap.abs()) / -0.3 / length.detach().clamp(min=1) * 8)], 1)
-        image_i, image_j = (torch.cat([x, extra], 1) for x in (image_i, image_j))
+        gap = _refined_gap(refined, i, j, length)
+        image_i, image_j = (
+            torch.cat([_look_up(evidence, disparity.detach()[:, 0], *ends), gap], 1) for ends in ((i, j), (j, i))
+        )
     return Quantities(
         nodes, cost, image, has_cost, has_image, centered, refined, batch, share.float(), degree[:, None],
         i, j, edges, odd, image_i, image_j, step.t(), receivers, matches.num_pairs, evidence is not None,
@@ -243,8 +238,13 @@ def _union(adjacency0: Adjacency, adjacency1: Adjacency) -> tuple[Tensor, Tensor
     return i, keys - i * size, in0, in1
 
 
-def _edge_quantities(points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(U, NUM_EDGE) quantities; (U, NUM_ODD) those that change sign with the way; (2, U) way from i to j in view 0 and (U,) its length in px."""
+def _edge_quantities(
+    points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(U, NUM_EDGE) quantities, the same for both ends; (U, NUM_ODD) those that change their sign with the way.
+
+    (2, U) way from i to j in view 0, and (U,) its length in px.
+    """
     x0, y0, x1, y1 = (points.index_select(0, j) - points.index_select(0, i)).t().contiguous()
     length0, length1 = ((x.square() + y.square() + _TINY_PX2).sqrt() for x, y in ((x0, y0), (x1, y1)))
     step = x0 - x1
@@ -272,23 +272,26 @@ def _edge_quantities(points: Tensor, i: Tensor, j: Tensor, in0: Tensor, in1: Ten
     return torch.stack(columns).t(), odd.t(), torch.stack([x0, y0]), length0
 
 
-def _look_up(evidence: ImageEvidence, disparity: Tensor, i: Tensor, j: Tensor, way: Tensor) -> Tensor:
-    """(U, 9) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
+def _look_up(evidence: ImageEvidence, disparity: Tensor, i: Tensor, j: Tensor) -> Tensor:
+    """(U, 5) would the disparity of j explain the windows of i better, in either view, and was it searched?"""
     _, num_curves, width = evidence.curve0.shape
     if not width:
-        return evidence.values.new_zeros(len(i), NUM_EDGE_IMAGE - 4)
+        return evidence.values.new_zeros(len(i), 2 * num_curves + 1)
     other = disparity.index_select(0, j)  # float64
     column = (other - evidence.first.index_select(0, i)).round().long()
     known = (column >= 0) & (column < evidence.num_columns.index_select(0, i))
-    place = torch.where(known, column, 0) + i * width * num_curves
+    place = torch.where(known, column, 0) + i * (num_curves * width)
     far = known & ((other - disparity.index_select(0, i)).abs() >= 0.5)
-    dx, dy = way
-    sideways = dx.abs() >= dy.abs()
-    toward = torch.where(sideways, torch.where(dx > 0, 3, 2), torch.where(dy > 0, 5, 4))
-    away = torch.where(sideways, torch.where(dx > 0, 2, 3), torch.where(dy > 0, 4, 5))
     values = [
         curve.reshape(-1).index_select(0, place + k * width) * far
         for curve in (evidence.curve0, evidence.curve1)
-        for k in (0, 1, toward, away)
+        for k in range(num_curves)
     ]
     return torch.stack([*values, known.float()], 1)
+
+
+def _refined_gap(refined: Tensor, i: Tensor, j: Tensor, length: Tensor) -> Tensor:
+    """(U, NUM_REFINED) how far the disparities that the images favour differ."""
+    gap = (refined.index_select(0, j) - refined.index_select(0, i)).abs()
+    columns = [torch.exp(gap / -0.3), torch.exp(-gap), torch.log1p(gap), torch.exp(-27 * gap / length.clamp(min=1))]
+    return torch.stack(columns, 1)

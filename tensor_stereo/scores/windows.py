@@ -1,0 +1,144 @@
+"""Windows of images around keypoints, and what they cost where they are held against another image."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+RADIUS_PX = 7  # of the largest window
+NOISE_VARIANCE = 2.0  # grey levels squared; keeps windows without texture from deciding
+_LIKENESS_LEVELS, _LIKENESS_PX2 = 12.0, 40.0  # fall-off of the weights of pixels unlike the 3 x 3 px in the middle
+_TIGHT_LEVELS, _TIGHT_PX2 = 10.0, 8.0  # the same around the pixel in the middle alone
+SMALL, MIDDLE, LIKE, TIGHT = range(4)  # whole windows, which are also held against the row
+NUM_WHOLE, NUM_HALVES = 4, 4  # half windows come behind the whole ones
+
+
+def sample_windows(image: Tensor, centers: Tensor, radius_x: int) -> Tensor:
+    """(m, 15, 2 rx + 1) grey levels around sub-pixel centres (m, 2) px; bilinear, the border repeated.
+
+    >>> sample_windows(torch.arange(9.0).expand(5, 9), torch.tensor([[4.5, 2.0]]), 1)[0, 0]
+    tensor([3.5000, 4.5000, 5.5000])
+    """
+    return sample_strips(image, centers[:, 0] - radius_x, centers[:, 1], 2 * radius_x + 1)
+
+
+def sample_strips(image: Tensor, left: Tensor, center_y: Tensor, width: int) -> Tensor:
+    """(m, 15, width) grey levels of strips that begin at x = ``left``; bilinear, the border repeated.
+
+    >>> sample_strips(torch.arange(9.0).expand(5, 9), torch.tensor([3.0]), torch.tensor([2.0]), 3)[0, 0]
+    tensor([3., 4., 5.])
+    """
+    height, num_columns = image.shape
+    left = left.clamp(-2.0 * width, num_columns + 2.0 * width)
+    center_y = center_y.clamp(-2.0 * RADIUS_PX, height + 2.0 * RADIUS_PX)
+    x0, y0 = left.floor(), center_y.floor()
+    fx, fy = (left - x0)[:, None, None], (center_y - y0)[:, None, None]
+    rows = torch.arange(-RADIUS_PX, RADIUS_PX + 2, device=image.device)
+    x = (x0.long()[:, None] + torch.arange(width + 1, device=image.device)).clamp(0, num_columns - 1)
+    y = (y0.long()[:, None] + rows).clamp(0, height - 1)
+    levels = image.reshape(-1)[y[:, :, None] * num_columns + x[:, None]]
+    levels = levels[:, :-1] + fy * (levels[:, 1:] - levels[:, :-1])
+    return levels[..., :-1] + fx * (levels[..., 1:] - levels[..., :-1])
+
+
+def sample_slanted(image: Tensor, centers: Tensor, radius_x: int, shear: Tensor) -> Tensor:
+    """(m, 15, 2 rx + 1) grey levels around sub-pixel centres, of the places that a slanted surface moves there.
+
+    Args:
+        image: (H, W).
+        centers: (m, 2) px.
+        radius_x: of the windows.
+        shear: (m, 2) px/px, by how much a column of the window moves to the right with its own x and y.
+
+    >>> sample_slanted(torch.arange(9.0).expand(5, 9), torch.tensor([[4.0, 2.0]]), 1, torch.tensor([[0.5, 0.0]]))[0, 7]
+    tensor([2.5000, 4.0000, 5.5000])
+    """
+    height, width = image.shape
+    v = torch.arange(-RADIUS_PX, RADIUS_PX + 1, device=image.device, dtype=torch.float32)[:, None]
+    u = torch.arange(-radius_x, radius_x + 1, device=image.device, dtype=torch.float32)
+    x, y = (part[:, None, None] for part in centers.unbind(1))
+    along_x, along_y = (part[:, None, None] for part in shear.unbind(1))
+    x = (x + u + along_x * u + along_y * v).clamp(0, width - 1)
+    y = (y + v).clamp(0, height - 1)
+    x0, y0 = x.floor(), y.floor()
+    fx, fy = x - x0, y - y0
+    left, top = x0.long(), y0.long()
+    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+    flat = image.reshape(-1)
+    upper, lower = (flat[row * width + left] * (1 - fx) + flat[row * width + right] * fx for row in (top, bottom))
+    return upper + fy * (lower - upper)
+
+
+def window_kernels(windows: Tensor) -> Tensor:
+    """(m, 225, 8) weights with sum 1 of the pixels of m windows.
+
+    5 x 5 and 11 x 11 boxes; pixels like the 3 x 3 px in the middle (Yoon & Kweon 2006); pixels near the middle and like
+    it, which keep to one side of an edge; and the left, right, upper and lower half of 11 x 11.
+
+    >>> window_kernels(torch.rand(2, 15, 15)).sum(1)[0, :3]
+    tensor([1.0000, 1.0000, 1.0000])
+    """
+    side = windows.shape[1]
+    r = torch.arange(side, device=windows.device) - RADIUS_PX
+    y, x = r[:, None].expand(side, side), r.expand(side, side)
+    middle = (x.abs() <= 5) & (y.abs() <= 5)
+    small = (x.abs() <= 2) & (y.abs() <= 2)
+    boxes = torch.stack([small, middle]).float().expand(len(windows), -1, -1, -1)
+    halves = torch.stack([middle & (x <= 1), middle & (x >= -1), middle & (y <= 1), middle & (y >= -1)])
+    far = (x.square() + y.square()).float()
+    center = windows[:, RADIUS_PX - 1 : RADIUS_PX + 2, RADIUS_PX - 1 : RADIUS_PX + 2].mean((1, 2))
+    like = _likeness(windows, center, _LIKENESS_LEVELS, far / _LIKENESS_PX2) + 1e-4
+    tight = _likeness(windows, windows[:, RADIUS_PX, RADIUS_PX], _TIGHT_LEVELS, far / _TIGHT_PX2) + 1e-5
+    weights = torch.cat([boxes, like, tight, halves.float().expand(len(windows), -1, -1, -1)], 1).flatten(2)
+    return (weights / weights.sum(2, keepdim=True)).transpose(1, 2)
+
+
+def compare_windows(windows: Tensor, strips: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Log zero-mean SSD (m, D, K), correlation (m, D, K), and log variance of the windows (m, K).
+
+    Where the kernel :data:`TIGHT` is among the K, its SSD also counts how far the means differ.
+
+    Args:
+        windows: (m, 15, 15).
+        strips: (m, 15, D + 14): D windows, each one column on.
+        kernels: (m, 225, K) weights.
+
+    >>> windows = torch.rand(1, 15, 15)
+    >>> compare_windows(windows, windows, window_kernels(windows))[0].exp().round()
+    tensor([[[2., 2., 2., 2., 2., 2., 2., 2.]]])
+    """
+    side, k = windows.shape[1], kernels.shape[2]
+    level = windows.mean((1, 2))[:, None, None]  # near zero the squares keep their digits
+    anchor = (windows - level).flatten(1)[..., None]
+    moving = (strips - level).unfold(2, side, 1).transpose(1, 2).reshape(len(strips), -1, side * side)
+    sums = moving @ torch.cat([kernels, kernels * anchor], 2)
+    squares = moving.square_() @ kernels
+    mean, product = sums[..., :k], sums[..., k:]
+    anchor_mean = (kernels * anchor).sum(1)
+    anchor_variance = ((kernels * anchor.square()).sum(1) - anchor_mean.square()).clamp(min=0)
+    variance = (squares - mean.square()).clamp(min=0)
+    covariance = product - mean * anchor_mean[:, None]
+    difference = (variance + anchor_variance[:, None] - 2 * covariance).clamp(min=0)
+    if k > TIGHT:
+        difference[..., TIGHT] += (mean[..., TIGHT] - anchor_mean[:, None, TIGHT]).square()
+    scale = (variance + NOISE_VARIANCE) * (anchor_variance[:, None] + NOISE_VARIANCE)
+    return torch.log(difference + NOISE_VARIANCE), covariance / scale.sqrt(), torch.log(anchor_variance + 1)
+
+
+def lowest_place(log_ssd: Tensor) -> Tensor:
+    """(m, K) places from the middle one to the lowest of (m, D, K), by the parabola of the SSD around it.
+
+    >>> lowest_place(torch.tensor([9.0, 4.0, 1.0, 1.0, 4.0]).log()[None, :, None])
+    tensor([[0.5000]])
+    """
+    ssd = log_ssd.exp()
+    num_places = ssd.shape[1]
+    k = ssd.argmin(1, keepdim=True).clamp(1, num_places - 2)
+    before, least, after = (ssd.gather(1, k + step)[:, 0] for step in (-1, 0, 1))
+    bend = (before - 2 * least + after).clamp(min=1e-3)
+    return k[:, 0] - num_places // 2 + ((before - after) / (2 * bend)).clamp(-1, 1)
+
+
+def _likeness(windows: Tensor, center: Tensor, levels: float, far: Tensor) -> Tensor:
+    unlike = (windows - center[:, None, None]).abs() / levels
+    return torch.exp(-unlike - far)[:, None]

@@ -1,10 +1,11 @@
-"""Fit the calibration of the consensus score on the records that ``train_learned.py`` leaves in its folder WORK.
+"""Fit the calibration of the consensus score on the putatives that ``train_learned.py`` leaves in its folder WORK.
 
     python benchmarks/training/calibrate_consensus.py WORK
 
-Prints slope and bias for rectified and other pairs, with and without costs, and the expected calibration error of each
-kind of matches. ``tensor_stereo/scores/calibration.py`` holds slope and bias rounded, the same with and without costs.
-Only real scenes are used, because rendered ones have another share of correct matches.
+Prints slope and bias of each tolerance for rectified and other pairs, fitted with and without costs together, and the
+expected calibration error of each domain and kind of matches. ``tensor_stereo/scores/calibration.py`` holds them
+rounded. Only real scenes are used, because rendered ones have another share of correct matches; row offsets are taken
+out as the score takes them out.
 """
 
 from __future__ import annotations
@@ -21,45 +22,54 @@ from torch import Tensor
 from tensor_stereo.classification import classify_graphs
 from tensor_stereo.configs import UNRECTIFIED, FilterConfig
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores import calibrate_consensus, consensus_belief
+from tensor_stereo.scores import consensus_belief
+from tensor_stereo.scores.alignment import estimate_alignment
+from tensor_stereo.scores.tolerance import TOLERANCES_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.calibration_error import calibration_error
 from training.platt_scaling import fit_calibration
-from training.work_folder import FOLDS, load_records
+from training.putatives import Putatives
+from training.work_folder import load_putatives
 
 EPS = 1e-4  # beliefs are cut to EPS..1 - EPS before their log-odds are taken
 
 
+def believe(given: Putatives, config: FilterConfig, *, has_cost: bool) -> tuple[Tensor, Tensor]:
+    """(K,) log-odds of the tested matches whose truth is known, and their errors in px."""
+    matches = given.matches if has_cost else replace(given.matches, cost=None)
+    graphs = build_match_graphs(matches)
+    known = given.error_px.isfinite() & (classify_graphs(graphs).relation != 0)
+    belief = consensus_belief(matches, graphs, config, estimate_alignment(matches, graphs))
+    return torch.logit(belief[known].double(), eps=EPS), given.error_px[known]
+
+
 def main() -> None:
+    torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    records = load_records(parser.parse_args().work, [scene for fold in FOLDS for scene in fold])
-    for rectified, config in ((True, FilterConfig()), (False, FilterConfig(consensus=UNRECTIFIED))):
-        for has_cost in (True, False):
-            beliefs, truths, weights = [], [], []
+    putatives = load_putatives(parser.parse_args().work)
+    for title, config in (("rectified", FilterConfig()), ("not rectified", FilterConfig(consensus=UNRECTIFIED))):
+        found = [
+            (one, *believe(one, config, has_cost=has_cost))
+            for one in putatives
+            for has_cost in ((True, False) if one.matches.cost is not None else (False,))
+        ]
+        for tolerance in TOLERANCES_PX:
+            judged = [item for item in found if item[0].least_error_px <= tolerance and len(item[1])]
+            logit = torch.cat([logit for _, logit, _ in judged])
+            correct = torch.cat([error for *_, error in judged]) <= tolerance
+            weight = torch.cat([torch.full((len(logit),), len(logit) ** -0.5) for _, logit, _ in judged])
+            slope, bias = fit_calibration(logit, correct, weight).tolist()
+            print(f"{title}, {tolerance:g} px: slope {slope:.2f}, bias {bias:.2f}")
             groups: defaultdict[str, list[tuple[Tensor, Tensor]]] = defaultdict(list)
-            for record in records:
-                matches = record.matches if has_cost else replace(record.matches, cost=None)
-                graphs = build_match_graphs(matches)
-                known = record.valid & (classify_graphs(graphs).relation != 0)
-                if not known.any():
-                    continue
-                belief, correct = consensus_belief(matches, graphs, config)[known].double(), record.correct[known]
-                beliefs.append(belief)
-                truths.append(correct)
-                weights.append(torch.full((len(belief),), len(belief) ** -0.5))
-                if record.fixed:
-                    groups[f"{record.detector}{', gated' if record.gated else ''}"].append((belief, correct))
-            parts = torch.logit(torch.cat(beliefs), eps=EPS), torch.cat(truths), torch.cat(weights)
-            slope, bias = fit_calibration(*parts).tolist()
-            title = f"{'' if rectified else 'not '}rectified, {'with' if has_cost else 'no'} cost"
-            print(f"{title}: slope {slope:.3f}, bias {bias:.3f}")
-            for name, found in sorted(groups.items()):
-                belief, correct = (torch.cat(part) for part in zip(*found, strict=True))
-                raw = calibration_error(belief, correct)
-                error = calibration_error(calibrate_consensus(belief, rectified=rectified), correct)
-                print(f"  {name:12} calibration error {raw:.3f}, calibrated {error:.3f}")
+            for one, logit, error in judged:
+                if one.fixed:
+                    groups[f"{one.domain}, {one.kind}"].append((logit, error <= tolerance))
+            for name, parts in sorted(groups.items()):
+                logit, correct = (torch.cat(part) for part in zip(*parts, strict=True))
+                error = calibration_error(torch.sigmoid(round(slope, 2) * logit + round(bias, 2)), correct)
+                print(f"  {name:20} calibration error {error:.3f}")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "bindings.hpp"
+#include "tensor_stereo/agreeing_neighbors.hpp"
 #include "tensor_stereo/consensus_belief.hpp"
 #include "tensor_stereo/gated_ssd.hpp"
 #include "tensor_stereo/one_to_one.hpp"
@@ -66,6 +67,25 @@ auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::o
     return give(std::move(belief), num_matches);
 }
 
+auto agreeing_neighbors(Points points0, Points points1, Integers crow0, Integers cols0, Integers crow1, Integers cols1,
+                        double row_px, double disparity_px, double slope, int num_threads) {
+    const std::size_t num_matches = points0.shape(0);
+    const auto num_rows = static_cast<std::int64_t>(num_matches);
+    check(points1.shape(0) == num_matches, "keypoints0 and keypoints1 must have the same length");
+    check(crow0.shape(0) == num_matches + 1 && crow1.shape(0) == num_matches + 1, "crow must have one row per match");
+    check_offsets(crow0, static_cast<std::int64_t>(cols0.shape(0)), "crow0 must rise from 0 to the length of cols0");
+    check_offsets(crow1, static_cast<std::int64_t>(cols1.shape(0)), "crow1 must rise from 0 to the length of cols1");
+    check_index(cols0, num_rows, "cols0 must name matches");
+    check_index(cols1, num_rows, "cols1 must name matches");
+    auto count = ts::allocate<std::int64_t>(num_matches);
+    {
+        const nb::gil_scoped_release release;
+        ts::agreeing_neighbors(points0.data(), points1.data(), crow0.data(), cols0.data(), crow1.data(), cols1.data(),
+                               num_rows, row_px, disparity_px, slope, num_threads, count.get());
+    }
+    return give(std::move(count), num_matches);
+}
+
 auto one_to_one(Points points0, Points points1, Integers ptr, std::optional<Doubles> cost, int num_threads) {
     const std::size_t num_matches = points0.shape(0);
     check(points1.shape(0) == num_matches, "points0 and points1 must have the same length");
@@ -112,6 +132,9 @@ void bind_matches(nb::module_& module) {
                nb::arg("crow1"), nb::arg("cols1"), nb::arg("tolerance"), nb::arg("whole_tolerance"),
                nb::arg("row_tolerance").none(), nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"),
                nb::arg("doubt"), nb::arg("cost_weight"), nb::arg("num_rounds"), nb::arg("num_threads"));
+    module.def("agreeing_neighbors", &agreeing_neighbors, nb::arg("points0"), nb::arg("points1"), nb::arg("crow0"),
+               nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"), nb::arg("row_px"), nb::arg("disparity_px"),
+               nb::arg("slope"), nb::arg("num_threads"));
     module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),
                nb::arg("cost").none(), nb::arg("num_threads"));
     module.def("gated_ssd", &gated_ssd, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("descriptors0"),

@@ -1,5 +1,6 @@
 """Operators of ``torch.library`` under the namespace ``tensor_stereo``, each with a slow reference."""
 
+from tensor_stereo.ops._agreeing_neighbors import agreeing_neighbors as agreeing_neighbors
 from tensor_stereo.ops._consensus_belief import consensus_belief as consensus_belief
 from tensor_stereo.ops._delaunay_graph import delaunay_graph as delaunay_graph
 from tensor_stereo.ops._delaunay_graph import match_graphs as match_graphs

@@ -42,6 +42,29 @@ def row_overlap(crow0: Tensor, cols0: Tensor, crow1: Tensor, cols1: Tensor) -> t
     return shared[crow0].diff(), degree0, degree1
 
 
+def agreeing_neighbors(
+    keypoints0: Tensor,
+    keypoints1: Tensor,
+    crow0: Tensor,
+    cols0: Tensor,
+    crow1: Tensor,
+    cols1: Tensor,
+    row_px: float,
+    disparity_px: float,
+    slope: float,
+) -> Tensor:
+    """How many neighbours move as a match does; see :func:`tensor_stereo.ops.agreeing_neighbors`."""
+    x, offset = keypoints0[:, 0].double(), keypoints1.double() - keypoints0.double()
+    seen = torch.stack([x, x - keypoints1[:, 0].double(), offset[:, 1]], 1)
+    count = torch.zeros_like(crow0[1:])
+    for crow, j in ((crow0, cols0), (crow1, cols1)):
+        i = torch.repeat_interleave(crow.diff())
+        way, disparity, row = (seen.index_select(0, i) - seen.index_select(0, j)).abs_().unbind(1)
+        agrees = (row <= row_px) & (disparity <= disparity_px + slope * way)
+        count.index_add_(0, i, agrees.to(count.dtype))
+    return count
+
+
 def relate(
     overlap: Tensor, degree0: Tensor, degree1: Tensor, group_size: Tensor, min_group_size: int, accept_subsets: bool
 ) -> tuple[Tensor, Tensor]:

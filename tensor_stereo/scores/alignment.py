@@ -11,7 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tensor_stereo import ops
 from tensor_stereo.batching import ptr_to_batch
+from tensor_stereo.configs import Backend
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.types import Matches, check_mask, check_vector
 
@@ -71,7 +73,7 @@ def align_matches(matches: Matches, alignment: Alignment) -> Matches:
 
 
 @torch.no_grad()
-def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
+def estimate_alignment(matches: Matches, graphs: MatchGraphs, *, backend: Backend = "auto") -> Alignment:
     """Fit row offset and slow row drift of every pair to the matches that agree with their neighbours.
 
     Two neighbours agree if their row offsets and their disparities are alike, which no common shift changes. The fit is
@@ -80,6 +82,7 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
     Args:
         matches: B pairs of views that are rectified up to the alignment, coordinates in px.
         graphs: The graphs of the same matches.
+        backend: As in :func:`tensor_stereo.classify_matches`.
 
     Returns:
         The alignment of every pair. It is zero where it stays below 0.1 px for all matches that agree. A pair does not
@@ -98,7 +101,11 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs) -> Alignment:
         tensor([[2.0000, 0.0100, 0.0000]], dtype=torch.float64)
     """
     check_match_graphs(matches, graphs)
-    return fit_alignment(matches, _agreeing(matches, graphs))
+    patterns = [x for view in graphs[:2] for x in (view.crow_indices, view.col_indices)]
+    votes = ops.agreeing_neighbors(
+        matches.keypoints0, matches.keypoints1, *patterns, _ROW_PX, _DISPARITY_PX, _SLOPE, backend
+    )
+    return fit_alignment(matches, votes >= _LEAST_VOTES)
 
 
 @torch.no_grad()
@@ -150,20 +157,6 @@ def fit_alignment(matches: Matches, agreeing: Tensor) -> Alignment:
     coefficients = torch.stack([a - b * middle[0] - c * middle[1], b, c], 1)
     keep = fitted & (largest >= _LEAST_SHIFT_PX)
     return Alignment(torch.where(keep[:, None], coefficients, 0), fitted, count.long())
-
-
-def _agreeing(matches: Matches, graphs: MatchGraphs) -> Tensor:
-    """(M,) bool, whether several neighbours of a match, counted in each view, move as it does."""
-    x = matches.keypoints0[:, 0].double()
-    offset = matches.keypoints1[:, 1].double() - matches.keypoints0[:, 1].double()
-    seen = torch.stack([offset, x - matches.keypoints1[:, 0].double(), x], 1).float()
-    votes = torch.zeros_like(offset, dtype=torch.int32)
-    for adjacency in (graphs.adjacency0, graphs.adjacency1):
-        i, j = adjacency.row_indices, adjacency.col_indices
-        rows, disparities, way = (seen.index_select(0, i) - seen.index_select(0, j)).abs_().unbind(1)
-        agrees = (rows <= _ROW_PX) & (disparities <= _DISPARITY_PX + _SLOPE * way)
-        votes.index_add_(0, i, agrees.to(votes.dtype))
-    return votes >= _LEAST_VOTES
 
 
 def _at(fit: list[Tensor], x: Tensor, y: Tensor, batch: Tensor) -> Tensor:

@@ -108,7 +108,7 @@ def score_matches(
     if graphs is None:
         graphs = build_match_graphs(matches, **options)  # type: ignore[arg-type]
     if alignment is None and is_aligned(config):
-        alignment = estimate_alignment(matches, graphs)
+        alignment = estimate_alignment(matches, graphs, backend=config.backend)
     domain = check_domain(matches, graphs, config, alignment)
     if name == "consensus":
         cumulative = consensus_probabilities(matches, graphs, config, alignment)

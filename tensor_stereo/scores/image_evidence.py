@@ -187,8 +187,10 @@ def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> Tenso
     levels = []
     for image, points in zip(gray, (points0, points1), strict=True):
         smooth = functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
-        x, y = points.round().long().unbind(1)
-        levels.append(smooth[y.clamp(0, image.shape[0] - 1), x.clamp(0, image.shape[1] - 1)])
+        x, y = (
+            place.round().clamp(0, size - 1).long() for place, size in zip(points.t(), smooth.t().shape, strict=True)
+        )
+        levels.append(smooth[y, x])
     return (levels[1] - levels[0]).median()
 
 

@@ -32,8 +32,8 @@ def plane_columns(trust: Tensor, q: Quantities, disparity: Tensor) -> Tensor:
     for near, far, sign in ((q.i, q.j, 1), (q.j, q.i, -1)):
         gap = disparity.index_select(0, far) - q.disparity.index_select(0, near)
         gap = gap.clamp(-_MAX_GAP_PX, _MAX_GAP_PX)
-        columns = (torch.ones_like(x), x * x, x * y, y * y, sign * x, sign * y, sign * gap * x, sign * gap * y, gap)
-        parts.append((torch.stack(columns) * trust.index_select(0, far)).t())
+        sums = (torch.ones_like(x), x * x, x * y, y * y, sign * x, sign * y, sign * gap * x, sign * gap * y, gap)
+        parts.append((torch.stack(sums) * trust.index_select(0, far)).t())
     total, xx, xy, yy, sx, sy, gx, gy, sg = q.receivers.sum(*parts).unbind(1)
     safe = total + 0.01
     mean_x, mean_y, mean_gap = sx / safe, sy / safe, sg / safe

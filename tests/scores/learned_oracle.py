@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates
+from scipy.special import expit
 
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
@@ -16,8 +16,6 @@ from tensor_stereo.types import Matches
 from tests.oracles import neighbor_sets
 
 Weights = dict[str, np.ndarray]
-RADIUS = 7
-ROW, COLUMN = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1]
 
 
 class Seen(NamedTuple):
@@ -29,10 +27,12 @@ class Seen(NamedTuple):
     image: np.ndarray | None  # (M, NUM_VALUES)
     has_image: np.ndarray  # (M,) bool
     disparity: np.ndarray  # (M,) px
+    refined: np.ndarray  # (M,) px
     pair: np.ndarray  # (M,) int
     linked: np.ndarray  # (M, M) bool, neighbours in either view
-    edges: np.ndarray  # (M, M, 14)
-    edge_image: np.ndarray  # (M, M, 3)
+    edges: np.ndarray  # (M, M, 15)
+    odd: np.ndarray  # (M, M, 2)
+    edge_image: np.ndarray  # (M, M, 9)
     step: np.ndarray  # (M, M, 2)
 
 
@@ -59,11 +59,12 @@ def random_evidence(seed: int, matches: Matches, *, seen: float = 1.0) -> ImageE
     """Made-up evidence of the right form; each pair has images with probability ``seen``."""
     rng = np.random.default_rng(seed)
     count, width = matches.num_matches, 24
-    curves = (torch.from_numpy(rng.normal(0, 2, (count, width))).float() for _ in range(2))
+    curves = (torch.from_numpy(rng.normal(0, 2, (count, 2, width))).float() for _ in range(2))
     shown = np.repeat(rng.random(matches.num_pairs) < seen, matches.ptr.diff().numpy())
     num_columns = torch.from_numpy(np.where(shown, rng.integers(1, width + 1, count), 0))
     values = torch.from_numpy(rng.normal(0, 1, (count, NUM_VALUES))).float()
-    return ImageEvidence(values, *curves, torch.from_numpy(rng.integers(-9, 6, count)).float(), num_columns)
+    first, offset = (torch.from_numpy(x).float() for x in (rng.integers(-9, 6, count), rng.normal(0, 0.7, count)))
+    return ImageEvidence(values, *curves, first, num_columns, offset)
 
 
 def see(matches: Matches, evidence: ImageEvidence | None = None, graphs: MatchGraphs | None = None) -> Seen:
@@ -75,7 +76,8 @@ def see(matches: Matches, evidence: ImageEvidence | None = None, graphs: MatchGr
     count = len(left)
     near = [a | b for a, b in zip(near0, near1, strict=True)]
     linked = np.array([[j in near[i] for j in range(count)] for i in range(count)], bool).reshape(count, count)
-    edges, edge_image, step = (np.zeros((count, count, k)) for k in (14, 3, 2))
+    refined = disparity if evidence is None else disparity + evidence.offset.double().numpy()
+    edges, odd, edge_image, step = (np.zeros((count, count, k)) for k in (15, 2, 9, 2))
     length = [{j: _length(left[j] - left[i]) for j in near[i]} for i in range(count)]
     reach = [np.mean([*found.values()]) if found else 0 for found in length]  # px, to the neighbours
     for i, j in np.argwhere(linked):
@@ -87,20 +89,25 @@ def see(matches: Matches, evidence: ImageEvidence | None = None, graphs: MatchGr
             *(min(gap / length0, 2), np.exp(-8 * gap / length0), np.exp(-row_gap), np.log1p(row_gap)),
             *(in0, in1, np.log(length0), np.log(length1 / length0), same * (in0 and in1)),
             abs(left[j, 1] - left[i, 1]) / length0,
+            np.tanh((disparity[j] - disparity[i]) / 4) * (left[j, 0] - left[i, 0]) / length0,
         ]
+        odd[i, j] = [np.tanh((disparity[j] - disparity[i]) / scale_px) for scale_px in (2, 8)]
         step[i, j] = (left[j] - left[i]) / ((reach[i] + reach[j]) / 2)
         if evidence is not None:
             column = int(np.round(disparity[j] - float(evidence.first[i])))
             if 0 <= column < int(evidence.num_columns[i]):
-                curves = [float(curve[i, column]) for curve in (evidence.curve0, evidence.curve1)]
-                edge_image[i, j] = [*(curves if gap >= 0.5 else (0, 0)), 1]
+                curves = [float(c) for curve in (evidence.curve0, evidence.curve1) for c in curve[i, :, column]]
+                edge_image[i, j, :5] = [*(curves if gap >= 0.5 else np.zeros(4)), 1]
+            between = abs(refined[j] - refined[i])
+            closeness = np.exp(-between / 0.3), np.exp(-between), np.exp(-27 * between / max(length0, 1))
+            edge_image[i, j, 5:] = [*closeness[:2], np.log1p(between), closeness[2]]
     return Seen(
         np.array([_node(*sets, abs(r)) for *sets, r in zip(near0, near1, row_offset, strict=True)]).reshape(-1, 8),
         *_relative_costs(matches),
         None if evidence is None else evidence.values.double().numpy(),
         np.zeros(count, bool) if evidence is None else evidence.num_columns.numpy() > 0,
-        *(disparity, np.repeat(np.arange(matches.num_pairs), matches.ptr.diff().numpy())),
-        *(linked, edges, edge_image, step),
+        *(disparity, refined, np.repeat(np.arange(matches.num_pairs), matches.ptr.diff().numpy())),
+        *(linked, edges, odd, edge_image, step),
     )
 
 
@@ -132,108 +139,6 @@ def _relative_costs(matches: Matches) -> tuple[np.ndarray, np.ndarray]:
     return columns, known
 
 
-def search_range(disparity: np.ndarray, row_offset: np.ndarray, voters: list[list[int]]) -> tuple[int, int]:
-    """First and number of the disparities to search in one pair; ``voters``: neighbours in view 0, then in view 1."""
-    if not len(disparity):
-        return 0, 0
-    level = abs(row_offset) <= 1.5
-    votes = [
-        sum(level[i] and level[j] and abs(disparity[i] - disparity[j]) <= 2 for j in near)
-        for i, near in enumerate(voters)
-    ]
-    supported = disparity[np.array(votes) >= 3]
-    believed = np.sort(supported if len(supported) >= 8 else disparity)
-    low, high = np.quantile(believed, [0.01, 0.99])
-    margin = max(4, 0.15 * (high - low))
-    first, last = int(np.floor(low - margin)), int(np.ceil(high + margin))
-    if last - first + 1 <= 256:
-        return first, last - first + 1
-    begins = np.floor(believed) - 3  # a match has three places on either side
-    held = [
-        ((believed >= value) & (believed < begin + 253)).sum() for value, begin in zip(believed, begins, strict=True)
-    ]
-    return int(begins[np.argmax(held)]), 256
-
-
-def measure_match(
-    images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], first: int, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values and both curves of one match, of two grey images."""
-    own = np.round(points[0][0] - points[1][0] - first)  # column of its disparity
-    sides = []
-    for view, sign in ((0, -1), (1, 1)):  # growing disparity moves the place in the other view to the left, the right
-        other, partner, point = images[1 - view], points[1 - view], points[view]
-        window, kernels = _window(images[view], *point), _kernels(_window(images[view], *point))
-        near = _compare(window, [_window(other, partner[0] + sign * k, partner[1]) for k in range(-3, 4)], kernels)
-        x = point[0] + sign * (first + np.arange(count))
-        row = _compare(window, [_window(other, place, point[1]) for place in x], kernels)
-        sides.append(_measure_view(window, kernels, near, row, (x < 0) | (x > other.shape[1] - 1), own))
-    level0, level1 = (_window(image, *point)[4:11, 4:11].mean() for image, point in zip(images, points, strict=True))
-    beyond = max(0, -own, own - (count - 1))
-    last = [abs(level0 - level1) / 16, min(np.log1p(beyond), 5)]
-    return np.concatenate([sides[0][0], sides[1][0], last]), sides[0][1], sides[1][1]
-
-
-def _measure_view(
-    window: np.ndarray,
-    kernels: list[np.ndarray],
-    near: tuple[np.ndarray, np.ndarray],
-    row: tuple[np.ndarray, np.ndarray],
-    outside: np.ndarray,
-    own: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    ssd, likeness = near  # (7 places, 7 kernels)
-    at, least = ssd[3], ssd.min(0)
-    column = np.arange(len(outside))
-    apart = abs(column - own)
-    rivals = column[(apart > 2) & ~outside]
-    margin, margin_likeness, crowd, distance = np.zeros((4, 3))
-    for k in range(3):
-        if len(rivals):
-            best = rivals[row[0][rivals, k].argmin()]
-            margin[k] = np.clip(row[0][best, k] - at[k], -6, 6)
-            margin_likeness[k] = likeness[3, k] - max(-1, row[1][rivals, k].max())
-            crowd[k] = (row[0][rivals, k] < at[k] + 0.3).sum() / len(column)
-            alike = rivals[row[0][rivals, k] <= row[0][best, k] + 1e-3]  # of which the nearest counts
-            distance[k] = np.log1p(min(apart[alike].min(), 100)) if margin[k] < -1e-3 else 0
-    variance = [(kernel * (window - (kernel * window).sum()) ** 2).sum() for kernel in kernels[:3]]
-    steps = np.diff(window[3:-3], axis=1)[:, 3:-3]  # along the rows of the middle 9 x 9
-    values = [(ssd - least)[:, :3].ravel(), at[:3], likeness[3, :3], margin, margin_likeness, crowd, distance]
-    values += [at[3:], (at - least)[3:], np.log1p(variance), [np.log1p((steps**2).mean())]]
-    return np.concatenate(values), np.where(outside, 6, np.clip(row[0][:, 2] - at[2], -6, 6))
-
-
-def _sample(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    height, width = image.shape
-    return map_coordinates(image, [y.clip(0, height - 1), x.clip(0, width - 1)], order=1)  # bilinear, border repeated
-
-
-def _window(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    return _sample(image, x + COLUMN, y + ROW)
-
-
-def _kernels(window: np.ndarray) -> list[np.ndarray]:
-    """Weights with sum 1: 5 x 5, 11 x 11, pixels like the 3 x 3 centre, and the left, right, upper, lower half."""
-    unlike = abs(window - window[6:9, 6:9].mean()) / 12
-    middle = (abs(ROW) <= 5) & (abs(COLUMN) <= 5)
-    halves = [middle & side for side in (COLUMN <= 1, COLUMN >= -1, ROW <= 1, ROW >= -1)]
-    similar = np.exp(-unlike - (ROW**2 + COLUMN**2) / 40) + 1e-4
-    kernels = [(abs(ROW) <= 2) & (abs(COLUMN) <= 2), middle, similar, *halves]
-    return [kernel / kernel.sum() for kernel in kernels]
-
-
-def _compare(window: np.ndarray, others: list[np.ndarray], kernels: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """(places, kernels) log of the zero-mean SSD, and correlation; both with noise of two squared grey levels."""
-    found = []
-    for other in others:
-        for kernel in kernels:
-            a, b = window - (kernel * window).sum(), other - (kernel * other).sum()
-            scale = np.sqrt(((kernel * a * a).sum() + 2) * ((kernel * b * b).sum() + 2))
-            found.append((np.log((kernel * (a - b) ** 2).sum() + 2), (kernel * a * b).sum() / scale))
-    ssd, likeness = np.array(found).reshape(len(others), len(kernels), 2).transpose(2, 0, 1)
-    return ssd, likeness
-
-
 def weights_of(network: LearnedScore) -> Weights:
     return {name: values.double().numpy() for name, values in network.state_dict().items()}
 
@@ -256,11 +161,16 @@ def infer(weights: Weights, seen: Seen, num_rounds: int = 3) -> tuple[np.ndarray
     for k in range(num_rounds):
         own = {name.removeprefix(f"rounds.{k}."): w for name, w in weights.items() if f"rounds.{k}." in name}
         hear, tell = np.split(_linear(own, "ends", state), 2, axis=1)
-        said = _linear(own, "edge", between) + _linear(own, "edge_image", shown) + hear[:, None] + tell
+        said = _linear(own, "edge", between) + _linear(own, "odd", seen.odd) + hear[:, None] + tell
+        said = said + _linear(own, "edge_image", shown)
         heard = (np.maximum(said, 0) * seen.linked[..., None]).sum(1) / np.maximum(seen.linked.sum(1, keepdims=True), 1)
         beliefs.append(_linear(own, "belief", state)[:, 0])
-        known = [state, heard, *([plane_columns(1 / (1 + np.exp(-beliefs[-1])), seen)] if k > 1 else [])]
+        trust = expit(beliefs[-1])
+        known = [state, heard, *([plane_columns(trust, seen, seen.disparity)] if k > 1 else [])]
         mixed = _linear(own, "mix", np.concatenate(known, 1)) + _linear(own, "whole", mean_of_pair @ state)
+        if k > 1 and seen.image is not None:
+            found = _linear(own, "mix_refined", plane_columns(trust, seen, seen.refined))
+            mixed = mixed + found * seen.has_image[:, None]
         state = state + _linear(own, "out", np.maximum(mixed, 0))
         state = (state - state.mean(1, keepdims=True)) / np.sqrt(state.var(1, keepdims=True) + 1e-5)
         state = state * own["norm.weight"] + own["norm.bias"]
@@ -276,24 +186,26 @@ def calibrate(weights: Weights, logit: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(1 / (1 + np.exp(-slope * logit - bias)), 1)
 
 
-def plane_columns(belief: np.ndarray, seen: Seen) -> np.ndarray:
-    """(M, 9) distances from the ridge regression of the neighbours' disparities on their places, and from their mean.
+def plane_columns(belief: np.ndarray, seen: Seen, disparity: np.ndarray) -> np.ndarray:
+    """(M, 14) distances from the ridge regression of the neighbours' disparities on their places, and from their mean.
 
     Both are weighted by the beliefs and seen from the match; 0.01 keeps the means of doubted neighbours near it.
     """
     rows = []
     for i in range(len(belief)):
         near = np.flatnonzero(seen.linked[i])
-        gap = np.clip(seen.disparity[near] - seen.disparity[i], -64, 64)
+        gap = np.clip(disparity[near] - seen.disparity[i], -64, 64)
         table = np.column_stack([np.clip(seen.step[i, near], -4, 4), gap])  # x, y, disparity
         total = belief[near].sum()
         mean = belief[near] @ table / (total + 0.01)
         moments = (table.T * belief[near]) @ table - total * np.outer(mean, mean)
         slope = np.linalg.solve(moments[:2, :2] + 0.3 * np.eye(2), moments[:2, 2])
-        residuals = abs(mean[2] - slope @ mean[:2]), abs(mean[2])
-        columns = [[np.exp(-r / 0.7), np.exp(-r / 2), np.exp(-r / 6), np.log1p(r)] for r in residuals]
-        rows.append([*columns[0], *columns[1], np.log1p(total)])
-    return np.array(rows).reshape(-1, 9)
+        miss, from_mean = abs(mean[2] - slope @ mean[:2]), abs(mean[2])
+        columns = [expit((1 - miss / tolerance) / 0.15) for tolerance in (0.5, 1, 2, 3, 5)]
+        for r in (miss, from_mean):
+            columns += [np.exp(-r / 0.7), np.exp(-r / 2), np.exp(-r / 6), np.log1p(r)]
+        rows.append([*columns, np.log1p(total)])
+    return np.array(rows).reshape(-1, 14)
 
 
 def _linear(weights: Weights, name: str, x: np.ndarray) -> np.ndarray:

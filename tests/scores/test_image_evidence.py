@@ -17,16 +17,20 @@ from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence, measure_images, search_ranges
 from tensor_stereo.types import Matches
 from tests.oracles import neighbor_sets
-from tests.scores.learned_oracle import measure_match, random_pairs, search_range
+from tests.scores.evidence_oracle import brightness, measure_match, search_range, slope_at
+from tests.scores.learned_oracle import random_pairs
 
-# The squares of centred grey levels reach 1e4, their weighted means here 2e3 (standard deviations of up to 45). float32
-# keeps sums of 225 such products to about sqrt(225) * 2^-24 * 2e3 = 2e-3 squared levels, and the logarithm of a mean of
-# squares is taken from 2 squared levels on: 1e-3, or twice that for a difference of two logarithms.
-ATOL = 4e-3
+# Levels are centred on the mean of one window; where the other one lies 100 levels away, squares reach 1e4. float32
+# keeps sums of 225 such products to about sqrt(225) * 2^-24 * 1e4 = 1e-2 squared levels, and the logarithm of the
+# mean is taken from 2 squared levels on: 5e-3, or twice that for a difference of two logarithms.
+ATOL = 1e-2
 HEIGHT, WIDTH = 60, 80
 SIDE = (NUM_VALUES - 2) // 2
-NAMES = ["near"] * 21 + ["whole"] * 3 + ["likeness"] * 3 + ["margin"] * 3 + ["margin_likeness"] * 3 + ["crowd"] * 3
-NAMES += ["distance"] * 3 + ["half"] * 4 + ["half_above"] * 4 + ["variance"] * 3 + ["gradient"]
+NAMES = ["near"] * 28 + ["whole"] * 4 + ["likeness"] * 4 + ["margin"] * 4 + ["margin_likeness"] * 4 + ["crowd"] * 4
+NAMES += ["distance"] * 4 + ["half"] * 4 + ["half_above"] * 4 + ["variance"] * 4 + ["gradient"]
+NAMES += ["along"] * 14 + ["along_gain"] * 2 + ["along_likeness"] * 2 + ["offset"] * 2
+MARGIN, DISTANCE = ([k for k, other in enumerate(NAMES) if other == name] for name in ("margin", "distance"))
+OFFSETS = [k for k, name in enumerate(2 * NAMES) if name == "offset"]
 
 
 def textured_views(seed: int, height: int = HEIGHT, width: int = WIDTH, *, noise: float = 2.0) -> list[Tensor]:
@@ -49,13 +53,18 @@ def level_surfaces(surfaces: list[tuple[int, int]], row_offset: float = 0.0) -> 
     return Matches(left, left - shift, torch.tensor([0, len(disparity)]))
 
 
-def ranges_of(matches: Matches) -> list[tuple[int, int]]:
+def voters_of(matches: Matches) -> list[list[int]]:
+    """Rows of the neighbours of every match in view 0, then in view 1."""
     graphs = build_match_graphs(matches)
-    near = [neighbor_sets(adjacency) for adjacency in graphs[:2]]
+    return [[*a, *b] for a, b in zip(*(neighbor_sets(adjacency) for adjacency in graphs[:2]), strict=True)]
+
+
+def ranges_of(matches: Matches) -> list[tuple[int, int]]:
+    near = voters_of(matches)
     disparity, row_offset = (matches.keypoints0 - matches.keypoints1).double().T.numpy()
     ranges = []
     for start, stop in pairwise(matches.ptr.tolist()):
-        voters = [[j - start for j in [*near[0][i], *near[1][i]]] for i in range(start, stop)]
+        voters = [[j - start for j in near[i]] for i in range(start, stop)]
         ranges.append(search_range(disparity[start:stop], row_offset[start:stop], voters))
     return ranges
 
@@ -67,25 +76,33 @@ def assert_same(
     ranges = ranges_of(matches)
     width = max((count for _, count in ranges), default=0)
     assert found.values.shape == (matches.num_matches, NUM_VALUES)
-    assert found.curve0.shape == found.curve1.shape == (matches.num_matches, width)
-    assert all(part.dtype == torch.float32 for part in found[:4])
+    assert found.curve0.shape == found.curve1.shape == (matches.num_matches, 2, width)
+    assert all(part.dtype == torch.float32 for name, part in found._asdict().items() if name != "num_columns")
     assert found.num_columns.dtype == torch.int64
     gray = [[to_gray(image[None])[0, 0].double().numpy() for image in images] for images in views]
     pair = np.repeat(np.arange(matches.num_pairs), matches.ptr.diff().numpy())
     points = [view.double().numpy() for view in (matches.keypoints0, matches.keypoints1)]
+    disparity, near = points[0][:, 0] - points[1][:, 0], voters_of(matches)
+    brighter = [
+        brightness((gray[0][b], gray[1][b]), tuple(view[pair == b] for view in points)) if (pair == b).any() else 0
+        for b in range(matches.num_pairs)
+    ]
     names = [*(f"{name} of view 0" for name in NAMES), *(f"{name} of view 1" for name in NAMES), "brighter", "beyond"]
     for row in range(matches.num_matches) if rows is None else rows:
         b = pair[row]
         first, count = ranges[b]
         assert (float(found.first[row]), int(found.num_columns[row])) == (first, count)
-        images, places = (gray[0][b], gray[1][b]), (points[0][row], points[1][row])
-        values, *curves = measure_match(images, places, first, count)
+        images, places = (gray[0][b], gray[1][b] - brighter[b]), (points[0][row], points[1][row])
+        expected = measure_match(images, places, first, count, slope_at(row, points[0], disparity, near[row]))
+        values = expected.values
         wrong = np.flatnonzero(~(abs(found.values[row].numpy() - values) <= ATOL))  # NaN too
-        told = [(names[k], float(found.values[row, k]), values[k]) for k in wrong]
+        told = [(names[k], float(found.values[row, k]), values[k]) for k in wrong if expected.clear or k not in OFFSETS]
         assert not told, f"match {row} at {places}: {told}"
-        for given, curve in zip((found.curve0, found.curve1), curves, strict=True):
-            np.testing.assert_allclose(given[row, :count], curve, rtol=0, atol=ATOL)
-            assert not given[row, count:].any()
+        if expected.clear:
+            assert float(found.offset[row]) == pytest.approx(expected.offset, abs=ATOL)
+        for given, curve in zip((found.curve0, found.curve1), expected.curves, strict=True):
+            np.testing.assert_allclose(given[row, :, :count], curve, rtol=0, atol=ATOL)
+            assert not given[row, :, count:].any()
 
 
 def measure(matches: Matches, *views: list[Tensor]) -> ImageEvidence:
@@ -134,7 +151,7 @@ def test_margins_end_at_six() -> None:
     found = measure(matches, *views)
     assert_same(found, matches, views)
     assert all((curve == 6).any() for curve in (found.curve0, found.curve1))
-    assert all((found.values[:, k : k + 3] > 5.5).any() for k in (27, SIDE + 27))
+    assert all((side[:, MARGIN] > 5.5).any() for side in found.values[:, :-2].split(SIDE, 1))
 
 
 def test_wrong_matches_see_the_nearest_of_equal_rivals() -> None:
@@ -147,7 +164,7 @@ def test_wrong_matches_see_the_nearest_of_equal_rivals() -> None:
     views = [[image], [image]]  # every nine pixels the same
     found = measure(matches, *views)
     assert_same(found, matches, views)
-    distance = found.values[:, 36:39]
+    distance = found.values[:, DISTANCE]
     assert (distance[disparity % 9 == 0] == 0).all()
     assert (distance[disparity % 9 == 4].expm1().round() == 4).all()
 
@@ -171,7 +188,7 @@ def test_matches_far_beyond_the_range_and_their_rivals() -> None:
     found = measure(matches, *views)
     assert_same(found, matches, views, range(6))
     assert found.values[:, -1].max() == 5
-    assert found.values[:, SIDE + 36 : SIDE + 39].max() == pytest.approx(np.log1p(100))
+    assert found.values[:, SIDE:-2][:, DISTANCE].max() == pytest.approx(np.log1p(100))
 
 
 def test_many_matches_of_one_pair() -> None:

@@ -31,7 +31,9 @@ def assert_same(q: Quantities, matches: Matches, evidence: ImageEvidence | None 
     expected = {
         "nodes": seen.nodes,
         "disparity": seen.disparity - (seen.disparity @ same / same.sum(0)),
+        "refined": seen.refined - (seen.disparity @ same / same.sum(0)),
         "edges": seen.edges[i, j],
+        "odd": seen.odd[i, j],
         "step": seen.step[i, j],
         "image_i": seen.edge_image[i, j],
         "image_j": seen.edge_image[j, i],
@@ -70,7 +72,7 @@ def test_few_matches(lengths: tuple[int, ...]) -> None:
     matches = random_pairs(5, lengths)
     evidence = random_evidence(5, matches)
     nothing = evidence._replace(
-        curve0=evidence.curve0[:, :0], curve1=evidence.curve1[:, :0], num_columns=torch.zeros(matches.num_matches)
+        curve0=evidence.curve0[..., :0], curve1=evidence.curve1[..., :0], num_columns=torch.zeros(matches.num_matches)
     )
     for seen in (evidence, nothing):
         assert_same(measure_quantities(matches, build_match_graphs(matches), seen), matches, seen)
@@ -122,17 +124,18 @@ def test_windows_are_asked_from_half_a_pixel_on_and_within_their_range() -> None
     matches = Matches(left, left - disparity, torch.tensor([0, 4]))
     curve = torch.arange(12.0).reshape(4, 3) + 1
     first, count = torch.tensor([2.0, 2.0, 3.0, 2.0]), torch.tensor([2, 3, 3, 1])
-    evidence = ImageEvidence(torch.zeros(4, NUM_VALUES), curve, -curve, first, count)
+    curves = [torch.stack([sign * curve, 20 * sign * curve], 1) for sign in (1, -1)]
+    evidence = ImageEvidence(torch.zeros(4, NUM_VALUES), *curves, first, count, torch.zeros(4))
     q = measure_quantities(matches, build_match_graphs(matches), evidence)
     assert_same(q, matches, evidence)
     told = {}
     for i, j, to_i, to_j in zip(q.i.tolist(), q.j.tolist(), q.image_i.tolist(), q.image_j.tolist(), strict=True):
-        told[i, j], told[j, i] = to_i, to_j
-    assert told[0, 1] == [1, -1, 1]  # half a pixel away, between columns 0 and 1: the even one
-    assert told[0, 2] == [0, 0, 1]  # a quarter of a pixel is the match's own disparity
-    assert told[2, 0] == [0, 0, 0]  # before the first column
-    assert told[1, 3] == [0, 0, 0]  # behind the last column
-    assert told[3, 1] == [10, -10, 1]
+        told[i, j], told[j, i] = to_i[:5], to_j[:5]
+    assert told[0, 1] == [1, 20, -1, -20, 1]  # half a pixel away, between columns 0 and 1: the even one
+    assert told[0, 2] == [0, 0, 0, 0, 1]  # a quarter of a pixel is the match's own disparity
+    assert told[2, 0] == [0, 0, 0, 0, 0]  # before the first column
+    assert told[1, 3] == [0, 0, 0, 0, 0]  # behind the last column
+    assert told[3, 1] == [10, 200, -10, -200, 1]
 
 
 def test_sums_reach_either_end() -> None:

@@ -6,39 +6,28 @@ import numpy as np
 import torch
 
 import tensor_stereo as ts
-from accuracy.putatives import MAX_ERROR_PX, Putatives, to_images, to_matches
+from accuracy.putatives import Putatives, to_images, to_matches
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
 from tensor_stereo.classification import classify_graphs
+from tensor_stereo.configs import FilterConfig
 from tensor_stereo.evaluation import match_rates
-from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores import (
-    calibrate_consensus,
-    consensus_belief,
-    keep_by_target,
-    load_learned,
-    measure_images,
-    probability_within,
-)
+from tensor_stereo.scores import consensus_belief, keep_by_target, score_matches
 
 TARGETS = ({"target_sensitivity": 0.9}, {"target_sensitivity": 0.96}, {"min_precision": 0.9}, {"min_precision": 0.95})
 
 
 def find_probabilities(found: list[Putatives]) -> tuple[ts.Matches, torch.Tensor, dict[str, torch.Tensor]]:
     """All pairs as one batch, which of their matches are tested, and by name the probabilities of being correct."""
-    matches, network = to_matches(found, with_cost=True), load_learned()
-    graphs = build_match_graphs(matches)
-    belief = consensus_belief(matches, graphs)
-    evidence = measure_images(*to_images(found), matches, graphs)
-    plain, shown = network(matches, graphs), network(matches, graphs, evidence)
+    matches = to_matches(found, with_cost=True)
+    consensus = score_matches(matches, FilterConfig(score="consensus"))
     probabilities = {
-        "consensus + cost, raw": belief,
-        "consensus + cost": probability_within(calibrate_consensus(belief), MAX_ERROR_PX),
-        "learned, no images": probability_within(plain[1], MAX_ERROR_PX),
-        "learned, raw": probability_within(torch.sigmoid(shown[0]), MAX_ERROR_PX),
-        "learned": probability_within(shown[1], MAX_ERROR_PX),
+        "consensus + cost, raw": consensus_belief(matches, consensus.graphs, alignment=consensus.alignment),
+        "consensus + cost": consensus.score,
+        "learned, no images": score_matches(matches).score,
+        "learned": score_matches(matches, images=tuple(to_images(found))).score,
     }
-    return matches, classify_graphs(graphs).relation != 0, probabilities
+    return matches, classify_graphs(consensus.graphs).relation != 0, probabilities
 
 
 @torch.no_grad()

@@ -26,6 +26,7 @@ from accuracy.dense_figures import draw_bars, draw_maps
 from accuracy.peers import score_disparity, score_lpm
 from accuracy.putatives import GrayPair, Putatives, find_putatives, load_pairs, to_matches
 from shared.harness import Suite
+from training.scenes import fold_of
 from training.work_folder import load_fold_networks
 
 DETECTORS = ("sift", "fast", "gftt")
@@ -187,10 +188,10 @@ def find_offsets(root: Path) -> dict[str, float]:
 
 
 def find_cases(
-    pairs: dict[str, list[GrayPair]], folds: dict[str, LearnedScore], detector: str, gated: bool
+    pairs: dict[str, list[GrayPair]], folds: list[LearnedScore], detector: str, gated: bool
 ) -> dict[str, list[Case]]:
     """The putative matches of one kind of all pairs, and their scores."""
-    networks = {"training": [folds[pair.scene] for pair in pairs["training"]]}
+    networks = {"training": [folds[fold_of(pair.scene)] for pair in pairs["training"]]}
     networks["eight"] = [load_learned()] * len(pairs["eight"])
     cases: dict[str, list[Case]] = {}
     for group, members in pairs.items():

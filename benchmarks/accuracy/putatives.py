@@ -18,7 +18,7 @@ import tensor_stereo as ts
 from shared.scenes import GATES
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.datasets import SyntheticDataset, find_pairs, read_pair
-from tensor_stereo.evaluation import matches_against_gt
+from tensor_stereo.evaluation import errors_against_gt
 from tensor_stereo.features import detect_features
 
 Float = NDArray[np.float64]
@@ -49,6 +49,8 @@ class Putatives:
         ratio: (M,) distance over that of the second-best candidate; NaN without one.
         valid: (M,) ground truth is known.
         correct: (M,) disparity and row are off by at most :data:`MAX_ERROR_PX`.
+        error_px: (M,) px, the larger one of the errors of disparity and row; NaN where the truth is unknown.
+        disparity_error_px: (M,) px, that of the disparity alone, as the paper counts.
         views: grey images (H, W) of both views.
     """
 
@@ -59,6 +61,8 @@ class Putatives:
     ratio: Float
     valid: Bool
     correct: Bool
+    error_px: Float
+    disparity_error_px: Float
     views: tuple[Gray, Gray]
 
     @property
@@ -125,9 +129,12 @@ def find_putatives(pair: GrayPair, detector: str, *, gated: bool) -> Putatives:
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.where(np.isfinite(second) & (second > 0), np.sqrt(best / second), np.nan)
     matches = ts.Matches(*map(torch.from_numpy, (points0, points1)), torch.tensor([0, len(points0)]))
-    disparity_gt = torch.from_numpy(pair.disparity_gt)[None]
-    correct, valid = (x.numpy() for x in matches_against_gt(matches, disparity_gt, max_error_px=MAX_ERROR_PX))
-    return Putatives(pair.scene, points0, points1, best, ratio, valid, correct, (pair.left, pair.right))
+    error = errors_against_gt(matches, torch.from_numpy(pair.disparity_gt)[None]).numpy()
+    x, y = np.rint(points0).astype(int).T
+    truth = pair.disparity_gt[y.clip(0, pair.left.shape[0] - 1), x.clip(0, pair.left.shape[1] - 1)]
+    off = np.where(np.isfinite(truth), np.abs(points0[:, 0] - points1[:, 0] - truth), np.nan)
+    valid, correct = ~np.isnan(error), error <= MAX_ERROR_PX
+    return Putatives(pair.scene, points0, points1, best, ratio, valid, correct, error, off, (pair.left, pair.right))
 
 
 def draw_random_partners(given: Putatives, share: float, seed: int) -> Putatives:
@@ -167,7 +174,7 @@ def to_images(found: list[Putatives]) -> list[list[torch.Tensor]]:
 
 
 def _select(given: Putatives, rows: Bool) -> Putatives:
-    names = ("points0", "points1", "cost", "ratio", "valid", "correct")
+    names = ("points0", "points1", "cost", "ratio", "valid", "correct", "error_px", "disparity_error_px")
     return replace(given, **{name: getattr(given, name)[rows] for name in names})
 
 

@@ -10,7 +10,7 @@ import torch
 import tensor_stereo as ts
 from accuracy.putatives import Putatives, to_images, to_matches
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.scores import consensus_belief, measure_images, score_learned
+from tensor_stereo.scores import consensus_belief, estimate_alignment, score_matches
 
 
 class Given(NamedTuple):
@@ -39,18 +39,17 @@ def score_consensus(given: Given) -> torch.Tensor:
 
     The belief before calibration, which ranks alike but for ties: the probability is cut at both ends.
     """
-    return consensus_belief(given.matches, given.graphs)
+    return consensus_belief(given.matches, given.graphs, alignment=estimate_alignment(given.matches, given.graphs))
 
 
 def score_without_images(given: Given) -> torch.Tensor:
     """The learned score, which sees points and cost only."""
-    return score_learned(given.matches, given.graphs)
+    return score_matches(given.matches, graphs=given.graphs).score
 
 
 def score_with_images(given: Given) -> torch.Tensor:
     """The learned score, with all evidence."""
-    evidence = measure_images(*to_images(given.found), given.matches, given.graphs)
-    return score_learned(given.matches, given.graphs, evidence)
+    return score_matches(given.matches, graphs=given.graphs, images=tuple(to_images(given.found))).score
 
 
 OURS = {

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tensor_stereo.scores.learned import learned_probabilities as learned_probabilities
     from tensor_stereo.scores.learned import load_learned as load_learned
     from tensor_stereo.scores.learned import score_learned as score_learned
+    from tensor_stereo.scores.slopes import estimate_slopes as estimate_slopes
     from tensor_stereo.scores.tolerance import TOLERANCES_PX as TOLERANCES_PX
     from tensor_stereo.scores.tolerance import probability_within as probability_within
 
@@ -47,6 +48,7 @@ __getattr__, __dir__, __all__ = attach(
         "consensus_score": "consensus",
         "describe_domain": "domain",
         "estimate_alignment": "alignment",
+        "estimate_slopes": "slopes",
         "fit_alignment": "alignment",
         "keep_by_target": "calibration",
         "learned_probabilities": "learned",

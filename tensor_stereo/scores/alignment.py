@@ -101,9 +101,17 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs, *, backend: Backen
         tensor([[2.0000, 0.0100, 0.0000]], dtype=torch.float64)
     """
     check_match_graphs(matches, graphs)
-    patterns = [x for view in graphs[:2] for x in (view.crow_indices, view.col_indices)]
     votes = ops.agreeing_neighbors(
-        matches.keypoints0, matches.keypoints1, *patterns, _ROW_PX, _DISPARITY_PX, _SLOPE, backend
+        matches.keypoints0,
+        matches.keypoints1,
+        graphs.adjacency0.crow_indices,
+        graphs.adjacency0.col_indices,
+        graphs.adjacency1.crow_indices,
+        graphs.adjacency1.col_indices,
+        _ROW_PX,
+        _DISPARITY_PX,
+        _SLOPE,
+        backend,
     )
     return fit_alignment(matches, votes >= _LEAST_VOTES)
 

@@ -37,11 +37,12 @@ def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
     slope, bias = torch.tensor(_CONSENSUS[rectified], dtype=torch.float64, device=belief.device).unbind(1)
     end = math.log((1 - _LEAST) / _LEAST)
     logits = torch.linspace(-end, end, _NUM_KNOTS + 1, dtype=torch.float64, device=belief.device)
-    knots, values = torch.sigmoid(logits), torch.sigmoid(slope * logits[:, None] + bias)  # (K,), (K, 5)
+    knots, values = torch.sigmoid(logits), torch.sigmoid(slope[:, None] * logits + bias[:, None])  # (K,), (5, K)
     place = belief.double().clamp(knots[0], knots[-1])
     k = torch.searchsorted(knots, place.detach(), right=True).clamp(1, len(knots) - 1) - 1
-    share = ((place - knots[k]) / (knots[k + 1] - knots[k]))[:, None]
-    return rising(values[k] + share * (values[k + 1] - values[k]))
+    share = (place - knots.index_select(0, k)) / (knots[1:] - knots[:-1]).index_select(0, k)
+    columns = [row.index_select(0, k) + share * row.diff().index_select(0, k) for row in values]
+    return rising(torch.stack(columns, 1))
 
 
 @torch.no_grad()

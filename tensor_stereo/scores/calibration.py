@@ -7,12 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from tensor_stereo.scores.tolerance import NUM_TOLERANCES, rising
+from tensor_stereo.scores.tolerance import rising
 
-# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999), rectified or not, at each of
-# TOLERANCES_PX, of which that of 1 px stands for all so far; fitted by
-# benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
-_CONSENSUS = {True: ((0.59, 2.60),) * NUM_TOLERANCES, False: ((0.65, 2.25),) * NUM_TOLERANCES}
+# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999) at each of TOLERANCES_PX, rectified
+# or not; fitted by benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
+_CONSENSUS = {
+    True: ((0.67, 0.45), (0.66, 2.40), (0.59, 3.14), (0.61, 3.63), (0.62, 4.03)),
+    False: ((0.74, 0.25), (0.75, 2.04), (0.62, 2.75), (0.62, 3.14), (0.60, 3.45)),
+}
 _LEAST = 1e-4  # probability, of either outcome
 _NUM_KNOTS = 2048  # linear between them, the probability is off by less than 3e-6
 _PARTS = 2**32  # of one match; whole numbers add up to the same in any order
@@ -30,7 +32,7 @@ def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
         falling with the tolerance. Gradients flow where the belief lies between 1e-4 and 1 - 1e-4.
 
     >>> calibrate_consensus(torch.tensor([0.0, 0.5, 1.0]))[:, 1]
-    tensor([0.0555, 0.9309, 0.9997], dtype=torch.float64)
+    tensor([0.0246, 0.9168, 0.9998], dtype=torch.float64)
     """
     # Linear between knots: exponentials would differ in the last bit between a vector's lanes and its rest, and a batch
     # would not equal the loop over its pairs.
@@ -42,7 +44,7 @@ def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
     k = torch.searchsorted(knots, place.detach(), right=True).clamp(1, len(knots) - 1) - 1
     share = (place - knots.index_select(0, k)) / (knots[1:] - knots[:-1]).index_select(0, k)
     columns = [row.index_select(0, k) + share * row.diff().index_select(0, k) for row in values]
-    return rising(torch.stack(columns, 1))
+    return rising(columns)
 
 
 @torch.no_grad()

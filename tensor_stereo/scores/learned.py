@@ -123,7 +123,7 @@ class LearnedScore(nn.Module):
     def calibrate(self, logit: Tensor) -> Tensor:
         """(M, 5) probability; logistic regression on the logits (Platt 1999), fitted on scenes left out of training."""
         slope, bias = self.calibration.unbind(1)
-        return rising(torch.sigmoid(slope * logit + bias))
+        return rising(torch.sigmoid(slope * logit + bias).unbind(1))
 
     def _normalize(self, name: str, values: Tensor) -> Tensor:
         mean, scale = getattr(self, f"{name}_mean"), getattr(self, f"{name}_scale")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -43,13 +45,13 @@ def probability_within(cumulative: Tensor | None, max_error_px: float) -> Tensor
     return torch.minimum(below + share * (above - below), above)  # rounding must not lift it above the next one
 
 
-def rising(values: Tensor) -> Tensor:
-    """The same (..., 5) values, each at least as large as those of smaller tolerances.
+def rising(columns: Sequence[Tensor]) -> Tensor:
+    """Stack the values (...) of five tolerances to (..., 5), each at least as large as those of smaller tolerances.
 
-    >>> rising(torch.tensor([0.2, 0.1, 0.4, 0.4, 0.3]))
+    >>> rising(torch.tensor([0.2, 0.1, 0.4, 0.4, 0.3]).unbind())
     tensor([0.2000, 0.2000, 0.4000, 0.4000, 0.4000])
     """
-    columns = [values[..., 0]]
-    for k in range(1, NUM_TOLERANCES):
-        columns.append(torch.maximum(columns[-1], values[..., k]))
-    return torch.stack(columns, -1)
+    largest = [columns[0]]
+    for values in columns[1:]:
+        largest.append(torch.maximum(largest[-1], values))
+    return torch.stack(largest, -1)

@@ -47,13 +47,13 @@ def slope_at(i: int, left: np.ndarray, disparity: np.ndarray, voters: list[int])
 
 
 def brightness(images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray]) -> float:
-    """Lower median, over the matches of a pair, of how much brighter 5 x 5 px around the keypoints of view 1 are."""
+    """Median, over the matches of a pair, of how much brighter 5 x 5 px around the keypoints of view 1 are."""
     levels = []
     for image, keypoints in zip(images, points, strict=True):
         height, width = image.shape
         x, y = (np.round(k).clip(0, size - 1).astype(int) for k, size in zip(keypoints.T, (width, height), strict=True))
         levels.append([image[max(b - 2, 0) : b + 3, max(a - 2, 0) : a + 3].mean() for a, b in zip(x, y, strict=True)])
-    return float(np.sort(np.subtract(levels[1], levels[0]))[(len(points[0]) - 1) // 2])
+    return float(np.median(np.subtract(levels[1], levels[0])))
 
 
 class Measured(NamedTuple):

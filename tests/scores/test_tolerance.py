@@ -27,7 +27,7 @@ def test_the_probability_never_falls_with_the_tolerance(
 @pytest.mark.parametrize("knot", TOLERANCES_PX[1:])
 def test_no_rounding_lifts_it_above_the_next_tolerance(knot: float, dtype: torch.dtype) -> None:
     logits = 3 * torch.randn(10_000, 5, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    cumulative = rising(logits.sigmoid())
+    cumulative = rising(logits.sigmoid().unbind(-1))
     for below in (np.nextafter(knot, 0), knot - 1e-9, knot - 1e-7):
         assert (probability_within(cumulative, float(below)) <= probability_within(cumulative, knot)).all()
 
@@ -40,7 +40,7 @@ def test_it_is_linear_between_the_tolerances(row: list[float], max_error_px: flo
 
 @pytest.mark.parametrize("k", range(5))
 def test_at_a_tolerance_it_is_the_prediction_bit_for_bit(k: int) -> None:
-    cumulative = rising(torch.rand(50, 5, generator=torch.Generator().manual_seed(k)))
+    cumulative = rising(torch.rand(50, 5, generator=torch.Generator().manual_seed(k)).unbind(1))
     assert torch.equal(probability_within(cumulative, TOLERANCES_PX[k]), cumulative[:, k])
 
 
@@ -65,5 +65,5 @@ def test_a_similarity_is_refused() -> None:
 
 @given(st.lists(st.floats(0, 1), min_size=5, max_size=5))
 def test_rising_lifts_only_what_falls(row: list[float]) -> None:
-    found = rising(torch.tensor(row, dtype=torch.float64)).tolist()
+    found = rising(torch.tensor(row, dtype=torch.float64).unbind()).tolist()
     assert found == np.maximum.accumulate(row).tolist()

@@ -197,7 +197,7 @@ def _sample_map(views: Views, config: PipelineConfig, largest_px: float) -> Matc
 
 
 def _disturb(matches: Matches, views: Views, rng: np.random.Generator, gated: bool) -> Matches:
-    """Leave matches out, make some wrong, move the keypoints of view 1 by parts of a px, each with some probability."""
+    """Leave matches out, make some wrong, move the keypoints of view 1, each with some probability."""
     left, right = matches.keypoints0.numpy(), matches.keypoints1.numpy()
     cost = np.zeros(len(left)) if matches.cost is None else matches.cost.numpy()
     height, width = views.image0.shape
@@ -214,8 +214,9 @@ def _disturb(matches: Matches, views: Views, rng: np.random.Generator, gated: bo
             right[wrong] = right[rng.permutation(wrong)]
         inside = right[:, 0] >= 0
         left, right, cost = left[inside], right[inside], cost[inside]
-    if rng.random() < 0.15:
-        right = (right + rng.normal(0, rng.uniform(0.1, 0.5), right.shape)).clip(0, [width - 1, height - 1])
+    if rng.random() < 0.2:
+        sigma_px = np.exp(rng.uniform(np.log(0.1), np.log(2)))
+        right = (right + rng.normal(0, sigma_px, right.shape)).clip(0, [width - 1, height - 1])
     if len(left) > MAX_MATCHES:
         kept = np.sort(rng.permutation(len(left))[:MAX_MATCHES])
         left, right, cost = left[kept], right[kept], cost[kept]

@@ -43,7 +43,7 @@ from training.scenes import NUM_FOLDS, Scene, list_scenes
 from training.work_folder import fold_weights, items_path, putatives_path
 
 SEED, EPOCHS, PAIRS_AT_ONCE = 0, 30, 8
-LEARNING_RATE, WEIGHT_DECAY = 8e-3, 1e-3
+LEARNING_RATE, WEIGHT_DECAY = 8e-3, 5e-2
 DROP_IMAGE, DROP_COST = 0.15, 0.30  # share of the pairs that are shown without
 BELIEF_WEIGHT = 0.2  # of the loss on the beliefs between rounds
 _TOLERANCES = torch.tensor(TOLERANCES_PX)

@@ -221,7 +221,7 @@ def _measure_both(
     own = (points[0][:, 0] - points[1][:, 0] - first).round()  # column of the match
     windows = [sample_windows(gray[view], points[view], RADIUS_PX) for view in (0, 1)]
     rows = points[0][:, 1] + row_shift, points[1][:, 1] - row_shift  # in the other view
-    shears = -slope, slope / (1 - slope[:, :1])
+    shears = -slope / (1 + slope[:, :1] / 2), slope / (1 - slope[:, :1] / 2)
     found = [
         _measure_one(
             gray[1 - v], windows[v], points[v], rows[v], points[1 - v], shears[v], own, first, count, reverse=not v

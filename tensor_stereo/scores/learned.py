@@ -31,7 +31,7 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
-from tensor_stereo.scores.planes import NUM_PLANE, plane_columns
+from tensor_stereo.scores.planes import NUM_PLANE, NUM_REFINED_PLANE, plane_columns
 from tensor_stereo.scores.tolerance import NUM_TOLERANCES, probability_within, rising
 from tensor_stereo.types import Adjacency, Matches
 
@@ -148,7 +148,7 @@ class MessageRound(nn.Module):
         self.belief = nn.Linear(width, 1)
         self.plane = plane
         self.mix = nn.Linear(width + edge_width + NUM_PLANE * plane, width)
-        self.mix_refined = nn.Linear(NUM_PLANE, width, bias=False) if plane else None
+        self.mix_refined = nn.Linear(NUM_REFINED_PLANE, width, bias=False) if plane else None
         self.whole = nn.Linear(width, width, bias=False)
         self.out = nn.Linear(width, width)
         self.norm = nn.LayerNorm(width)
@@ -164,10 +164,10 @@ class MessageRound(nn.Module):
             to_i, to_j = to_i.add_(self.edge_image(q.image_i)), to_j.add_(self.edge_image(q.image_j))
         heard = q.receivers.sum(to_i.relu_(), to_j.relu_()) / q.degree
         trust = torch.sigmoid(belief)
-        known = [state, heard, plane_columns(trust, q, q.disparity)] if self.plane else [state, heard]
+        known = [state, heard, plane_columns(trust, q, refined=False)] if self.plane else [state, heard]
         mixed = self.mix(torch.cat(known, 1)) + self.whole(_pair_mean(state, q)).index_select(0, q.batch)
         if self.mix_refined is not None and with_image:
-            mixed = mixed + self.mix_refined(plane_columns(trust, q, q.refined) * q.has_image)
+            mixed = mixed + self.mix_refined(plane_columns(trust, q, refined=True) * q.has_image)
         return self.norm(state + self.out(mixed.relu())), belief[:, 0]
 
 

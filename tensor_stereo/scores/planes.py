@@ -8,26 +8,30 @@ from torch import Tensor
 from tensor_stereo.scores.learned_inputs import Quantities
 from tensor_stereo.scores.tolerance import NUM_TOLERANCES, TOLERANCES_PX
 
-NUM_PLANE = 9 + NUM_TOLERANCES
+NUM_PLANE = 9
+NUM_REFINED_PLANE = NUM_PLANE + NUM_TOLERANCES
 _RIDGE = 0.3  # squared mean distances to neighbours; flattens planes that too few neighbours hold
 _MAX_GAP_PX = 64.0
 _SOFTNESS = 0.15  # of a tolerance, over which a miss passes from within to beyond
 
 
-def plane_columns(trust: Tensor, q: Quantities, disparity: Tensor) -> Tensor:
+def plane_columns(trust: Tensor, q: Quantities, *, refined: bool) -> Tensor:
     """How far each match is from the plane, and from the mean, through the disparities of its trusted neighbours.
 
     Args:
         trust: (M, 1) say of every match.
         q: What the network sees.
-        disparity: (M,) px, of the neighbours: as given, or refined by the images. That of the match itself is as given.
+        refined: Whether the disparities of the neighbours are those that the images favour, which tell parts of a px.
+            That of the match itself is as given.
 
     Returns:
-        (M, :data:`NUM_PLANE`): softly, whether the distance from the plane stays within each tolerance; functions of
-        both distances; log trust. Gradients flow.
+        (M, :data:`NUM_PLANE`): functions of both distances, which fall or rise all the way; log trust. Refined, (M,
+        :data:`NUM_REFINED_PLANE`): before them, softly, whether the distance from the plane stays within each
+        tolerance; such steps would leave a gradient nowhere else. Gradients flow.
     """
     x, y = q.step.clamp(-4, 4).unbind(1)
     trust = trust[:, 0]
+    disparity = q.refined if refined else q.disparity
     parts = []
     for near, far, sign in ((q.i, q.j, 1), (q.j, q.i, -1)):
         gap = disparity.index_select(0, far) - q.disparity.index_select(0, near)
@@ -43,7 +47,7 @@ def plane_columns(trust: Tensor, q: Quantities, disparity: Tensor) -> Tensor:
     determinant = (xx * yy - xy * xy).clamp(min=1e-3)
     slope_x, slope_y = (gx * yy - gy * xy) / determinant, (gy * xx - gx * xy) / determinant
     miss = (mean_gap - slope_x * mean_x - slope_y * mean_y).abs()
-    columns = [torch.sigmoid((1 - miss / tolerance) / _SOFTNESS) for tolerance in TOLERANCES_PX]
+    columns = [torch.sigmoid((1 - miss / t) / _SOFTNESS) for t in TOLERANCES_PX] if refined else []
     for residual in (miss, mean_gap.abs()):
         columns += [torch.exp(-residual / scale_px) for scale_px in (0.7, 2, 6)] + [torch.log1p(residual)]
     return torch.stack([*columns, torch.log1p(total)], 1)

@@ -17,7 +17,10 @@ _NUM_ROUNDS = 4
 
 @torch.no_grad()
 def estimate_slopes(matches: Matches, graphs: MatchGraphs) -> Tensor:
-    """How the disparity changes with x and y of view 0 around every match.
+    """How the disparity changes with x and y around every match.
+
+    The frame is the cyclopean one, midway between both views, in which these are alike: with slope s along x the
+    disparity changes by s / (1 + s / 2) per px of view 0 and by s / (1 - s / 2) per px of view 1.
 
     A plane through the disparity of the match is fitted to those of its neighbours in both views, by least squares with
     the weights of Geman & McClure (1987), so that neighbours across a depth edge have no say.
@@ -34,7 +37,7 @@ def estimate_slopes(matches: Matches, graphs: MatchGraphs) -> Tensor:
 
     >>> from tensor_stereo.graphs import build_match_graphs
     >>> left = torch.rand(99, 2, generator=torch.Generator().manual_seed(0)) * 300
-    >>> right = left - torch.stack([9 + 0.2 * left[:, 1], torch.zeros(99)], 1)
+    >>> right = left - torch.stack([9 + 0.2 * left[:, 1], torch.zeros(99)], 1)  # a floor
     >>> matches = Matches(left, right, torch.tensor([0, 99]))
     >>> estimate_slopes(matches, build_match_graphs(matches)).median(0).values.round(decimals=1).abs()
     tensor([0.0000, 0.2000])
@@ -42,8 +45,8 @@ def estimate_slopes(matches: Matches, graphs: MatchGraphs) -> Tensor:
     check_match_graphs(matches, graphs)
     views = (graphs.adjacency0, graphs.adjacency1)
     i, j = (torch.cat([getattr(view, name) for view in views]) for name in ("row_indices", "col_indices"))
-    x, y = matches.keypoints0.double().unbind(1)
-    disparity = x - matches.keypoints1[:, 0].double()
+    x, y = ((matches.keypoints0.double() + matches.keypoints1.double()) / 2).unbind(1)
+    disparity = matches.keypoints0[:, 0].double() - matches.keypoints1[:, 0].double()
     dx, dy, gap = (values.index_select(0, j) - values.index_select(0, i) for values in (x, y, disparity))
     length = (dx * dx + dy * dy).sqrt()
     near = 1 / (1 + (length / _REACH_PX).square())

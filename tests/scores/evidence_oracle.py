@@ -34,9 +34,10 @@ def search_range(disparity: np.ndarray, row_offset: np.ndarray, voters: list[lis
     return int(begins[np.argmax(held)]), 256
 
 
-def slope_at(i: int, left: np.ndarray, disparity: np.ndarray, voters: list[int]) -> np.ndarray:
-    """(2,) slope of the disparity around match i; ``voters``: its neighbours in view 0, then in view 1."""
-    way, gap = left[voters] - left[i], disparity[voters] - disparity[i]
+def slope_at(i: int, left: np.ndarray, right: np.ndarray, voters: list[int]) -> np.ndarray:
+    """(2,) slope of the disparity around match i, midway; ``voters``: its neighbours in view 0, then in view 1."""
+    middle, disparity = (left + right) / 2, left[:, 0] - right[:, 0]
+    way, gap = middle[voters] - middle[i], disparity[voters] - disparity[i]
     length = np.hypot(*way.T)
     say = np.where(abs(gap) <= 2 + length / 2, 1 / (1 + (gap / (1 + length / 5)) ** 2), 0)
     for _ in range(4):
@@ -81,7 +82,7 @@ def measure_match(
         near = _compare(window, [_window(other, partner[0] + sign * k, partner[1]) for k in range(-3, 4)], kernels)
         x = point[0] + sign * (first + np.arange(count))
         row = _compare(window, [_window(other, place, point[1]) for place in x], kernels)
-        shear = slope / (1 - slope[0]) if view else -slope
+        shear = slope / (1 - slope[0] / 2) if view else -slope / (1 + slope[0] / 2)
         places = [partner[0] + (1 + shear[0]) * (COLUMN + sign * k) + shear[1] * ROW for k in range(-3, 4)]
         slanted = [_sample(other, place, partner[1] + ROW) for place in places]
         along = _compare(window, slanted, kernels[1:3])

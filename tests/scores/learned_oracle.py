@@ -166,7 +166,7 @@ def infer(weights: Weights, seen: Seen, num_rounds: int = 3) -> tuple[np.ndarray
         heard = (np.maximum(said, 0) * seen.linked[..., None]).sum(1) / np.maximum(seen.linked.sum(1, keepdims=True), 1)
         beliefs.append(_linear(own, "belief", state)[:, 0])
         trust = expit(beliefs[-1])
-        known = [state, heard, *([plane_columns(trust, seen, seen.disparity)] if k > 1 else [])]
+        known = [state, heard, *([plane_columns(trust, seen, seen.disparity)[:, 5:]] if k > 1 else [])]
         mixed = _linear(own, "mix", np.concatenate(known, 1)) + _linear(own, "whole", mean_of_pair @ state)
         if k > 1 and seen.image is not None:
             found = _linear(own, "mix_refined", plane_columns(trust, seen, seen.refined))
@@ -187,7 +187,7 @@ def calibrate(weights: Weights, logit: np.ndarray) -> np.ndarray:
 
 
 def plane_columns(belief: np.ndarray, seen: Seen, disparity: np.ndarray) -> np.ndarray:
-    """(M, 14) distances from the ridge regression of the neighbours' disparities on their places, and from their mean.
+    """(M, 14) five steps, then functions of the distances from a ridge regression and from the mean of the neighbours.
 
     Both are weighted by the beliefs and seen from the match; 0.01 keeps the means of doubted neighbours near it.
     """

@@ -82,7 +82,7 @@ def assert_same(
     gray = [[to_gray(image[None])[0, 0].double().numpy() for image in images] for images in views]
     pair = np.repeat(np.arange(matches.num_pairs), matches.ptr.diff().numpy())
     points = [view.double().numpy() for view in (matches.keypoints0, matches.keypoints1)]
-    disparity, near = points[0][:, 0] - points[1][:, 0], voters_of(matches)
+    near = voters_of(matches)
     brighter = [
         brightness((gray[0][b], gray[1][b]), tuple(view[pair == b] for view in points)) if (pair == b).any() else 0
         for b in range(matches.num_pairs)
@@ -93,7 +93,7 @@ def assert_same(
         first, count = ranges[b]
         assert (float(found.first[row]), int(found.num_columns[row])) == (first, count)
         images, places = (gray[0][b], gray[1][b] - brighter[b]), (points[0][row], points[1][row])
-        expected = measure_match(images, places, first, count, slope_at(row, points[0], disparity, near[row]))
+        expected = measure_match(images, places, first, count, slope_at(row, *points, near[row]))
         values = expected.values
         wrong = np.flatnonzero(~(abs(found.values[row].numpy() - values) <= ATOL))  # NaN too
         told = [(names[k], float(found.values[row, k]), values[k]) for k in wrong if expected.clear or k not in OFFSETS]

@@ -169,15 +169,17 @@ def test_mirrored_views_change_places() -> None:
     twin = Matches(mirror(matches.keypoints1), mirror(matches.keypoints0), matches.ptr, matches.cost)
     turned = replace(pair, image0=pair.image1.flip(2), image1=pair.image0.flip(2))
     found, expected = evidence_of(twin, turned), evidence_of(matches, pair)
-    torch.testing.assert_close(found.curve0, expected.curve1, rtol=0, atol=ROUNDING)
-    torch.testing.assert_close(found.curve1, expected.curve0, rtol=0, atol=ROUNDING)
+    # log SSDs are compared with each other: twice the rounding of one
+    for curve, twin_curve in ((found.curve0, expected.curve1), (found.curve1, expected.curve0)):
+        torch.testing.assert_close(curve, twin_curve, rtol=0, atol=2 * ROUNDING)
+    torch.testing.assert_close(found.offset, expected.offset, rtol=0, atol=2 * ROUNDING)
     size = (NUM_VALUES - 2) // 2  # of one view; there the left and the right half windows change places
     halves = [52, 53, 56, 57]
     rest = [k for k in range(size) if k not in halves]
     own, other = (values.values[:, : 2 * size].reshape(-1, 2, size) for values in (found, expected))
-    torch.testing.assert_close(own[..., rest], other.flip(1)[..., rest], rtol=0, atol=ROUNDING)
+    torch.testing.assert_close(own[..., rest], other.flip(1)[..., rest], rtol=0, atol=2 * ROUNDING)
     swapped = other.flip(1)[..., [53, 52, 57, 56]]
-    torch.testing.assert_close(own[..., halves], swapped, rtol=0, atol=ROUNDING)
+    torch.testing.assert_close(own[..., halves], swapped, rtol=0, atol=2 * ROUNDING)
 
 
 def test_equal_rivals_do_not_hang_on_rounding() -> None:

@@ -20,7 +20,7 @@ def test_slopes_match_by_match(whole: bool) -> None:
     graphs = build_match_graphs(matches)
     near = [[*a, *b] for a, b in zip(*(neighbor_sets(adjacency) for adjacency in graphs[:2]), strict=True)]
     left, right = matches.keypoints0.numpy(), matches.keypoints1.numpy()
-    expected = [slope_at(i, left, left[:, 0] - right[:, 0], voters) for i, voters in enumerate(near)]
+    expected = [slope_at(i, left, right, voters) for i, voters in enumerate(near)]
     np.testing.assert_allclose(estimate_slopes(matches, graphs), expected, rtol=0, atol=1e-6)  # float32 of at most .5
 
 
@@ -28,7 +28,8 @@ def test_slopes_match_by_match(whole: bool) -> None:
 def test_slanted_surface_with_a_step(slope: tuple[float, float]) -> None:
     rng = np.random.default_rng(1)
     left = rng.random((600, 2)) * [400, 300]
-    disparity = 60 + left @ slope + np.where(left[:, 0] < 200, 0, 40)
+    per_px0 = np.array(slope) / (1 + slope[0] / 2)  # of the left view
+    disparity = 60 + left @ per_px0 + np.where(left[:, 0] < 200, 0, 40)
     wrong = rng.random(600) < 0.2
     disparity[wrong] = rng.random(wrong.sum()) * 90
     right = left - np.stack([disparity, np.zeros(600)], 1)

@@ -1,5 +1,7 @@
 """Where our probabilities hold: by domain, tolerance and kind of putatives, and where rows do not agree.
 
+Beside them stand peers that look at the coordinates alone.
+
     python benchmarks/accuracy/domains.py --training-data TRAINING_DATA --folds WORK
 
 The eight scenes of the paper are scored by the shipped weights, which never saw them; scenes of the training set by the
@@ -24,6 +26,7 @@ from tensor_stereo.scores import LearnedScore, load_learned, score_matches
 from tensor_stereo.scores.tolerance import TOLERANCES_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
+from accuracy.peers import score_disparity, score_lpm
 from accuracy.putatives import GrayPair, Putatives, find_putatives, load_pairs, to_images, to_matches
 from accuracy.ranking import interval
 from shared.calibration_error import calibration_error
@@ -31,16 +34,17 @@ from shared.harness import Suite
 from training.scenes import KITTI_LEAST_PX, fold_of
 from training.work_folder import load_fold_networks
 
+PEERS = ("LPM", "libviso2 support", "disparity median, Delaunay")
 KINDS = tuple((detector, gated) for detector in ("sift", "fast", "gftt") for gated in (False, True))
 SCORES = ("consensus", "learned, no images", "learned")
 MOVES = ((8.0, 0.02), (-8.0, -0.02), (3.0, 0.0))  # rows of view 1 at y + a + b x
 
 
 class Case(NamedTuple):
-    """One pair's putatives and what our scores say of them."""
+    """One pair's putatives and what scores say of them."""
 
     found: Putatives
-    cumulative: dict[str, torch.Tensor]  # by score, (M, 5)
+    cumulative: dict[str, torch.Tensor]  # by score, (M, 5); those of peers are the same for all tolerances
 
 
 def score(found: Putatives, network: LearnedScore, *, images: bool = True) -> dict[str, torch.Tensor]:
@@ -53,6 +57,12 @@ def score(found: Putatives, network: LearnedScore, *, images: bool = True) -> di
     if images:
         plain["learned"] = score_matches(matches, images=tuple(to_images([found])), network=network).cumulative
     return plain
+
+
+def score_coordinates(found: Putatives) -> dict[str, torch.Tensor]:
+    """The peers' scores (M, 5)."""
+    scores = {"LPM": score_lpm(found)} | score_disparity(found)
+    return {name: torch.from_numpy(scores[name])[:, None].expand(-1, len(TOLERANCES_PX)) for name in PEERS}
 
 
 def move_rows(given: Putatives, a: float, b: float) -> Putatives:
@@ -78,7 +88,7 @@ def report(suite: Suite, group: str, kind: str, cases: list[Case], least_px: flo
     """Ranking and calibration of every score at every tolerance that the truth can judge."""
     error = torch.from_numpy(np.concatenate([case.found.error_px for case in cases]))
     known = ~error.isnan()
-    for name in SCORES:
+    for name in (*PEERS, *SCORES):
         probability = torch.cat([case.cumulative[name] for case in cases])
         for k, tolerance in enumerate(TOLERANCES_PX):
             if tolerance < least_px:
@@ -86,9 +96,10 @@ def report(suite: Suite, group: str, kind: str, cases: list[Case], least_px: flo
             figures = rank(cases, name, k)
             auc, specificity = figures.mean(0)
             low, high = interval(figures[:, 0])
-            off = calibration_error(probability[known, k], error[known] <= tolerance)
-            title = f"{group}, {kind}, {name}, {tolerance:g} px"
-            suite.note(title, auc=auc, auc_low=low, auc_high=high, specificity_at_96=specificity, calibration_error=off)
+            values = {"auc": auc, "auc_low": low, "auc_high": high, "specificity_at_96": specificity}
+            if name in SCORES:
+                values["calibration_error"] = calibration_error(probability[known, k], error[known] <= tolerance)
+            suite.note(f"{group}, {kind}, {name}, {tolerance:g} px", **values)
         if group == "eight":
             auc, specificity = rank(cases, name, TOLERANCES_PX.index(1), rows_count=False).mean(0)
             suite.note(f"{group}, {kind}, {name}, 1 px, rows do not count", auc=auc, specificity_at_96=specificity)
@@ -126,12 +137,15 @@ def main() -> None:
             found = [find_putatives(pair, detector, gated=gated) for pair in pairs]
             held = [None if group == "eight" else fold_of(one.scene) for one in found]
             networks = [shipped if fold is None else folds[fold] for fold in held]
-            cases = [Case(one, score(one, network)) for one, network in zip(found, networks, strict=True)]
+            cases = [
+                Case(one, score(one, network) | score_coordinates(one))
+                for one, network in zip(found, networks, strict=True)
+            ]
             report(suite, group, kind, cases, KITTI_LEAST_PX if group == "KITTI" else 0)
             if group == "eight":
                 report_moved(suite, kind, cases, shipped)
             totals.append(cases)
-        for name in SCORES:
+        for name in (*PEERS, *SCORES):
             for k, tolerance in enumerate(TOLERANCES_PX):
                 if tolerance >= (KITTI_LEAST_PX if group == "KITTI" else 0):
                     auc, specificity = np.mean([rank(cases, name, k).mean(0) for cases in totals], 0)

@@ -49,16 +49,16 @@ def test_slanted_plane_keeps_every_match(a: int, b: int, stride: int) -> None:
 def test_patch_of_wrong_disparities_is_rejected_and_the_rest_kept(sign: int) -> None:
     disparity = plane(0.05, 0.0, 8 * sign)
     generator = torch.Generator().manual_seed(0)
-    disparity[0, 0, 20:40, 40:60] += 3 + 12 * torch.rand(20, 20, dtype=torch.float64, generator=generator)
+    disparity[0, 0, 20:40, 40:60] += 8 + 20 * torch.rand(20, 20, dtype=torch.float64, generator=generator)
     result = filter_disparity(disparity, 4, filter=DelaunayFilter(verdict="cardinality"))
     x, y = result.grid.unbind(-1)
     wrong = (x >= 40) & (x < 60) & (y >= 20) & (y < 40)
     assert not bool(result.inlier[0, 0][wrong].any())
-    # The probability keeps hardly any of them, and holds within .05 of what it keeps.
+    # The probability keeps none of them, and is a little too careful: the training had no scene as easy as a plane.
     by_score = filter_disparity(disparity, 4)
-    assert float(by_score.inlier[0, 0][wrong].double().mean()) < 0.2
+    assert float(by_score.inlier[0, 0][wrong].double().mean()) == 0
     precision = float((~wrong)[by_score.inlier[0, 0]].double().mean())
-    assert precision == pytest.approx(float(by_score.score[by_score.inlier].mean()), abs=0.05)
+    assert precision == pytest.approx(float(by_score.score[by_score.inlier].mean()), abs=0.08)
     # Beyond the columns that the patch covers in either view, nothing has changed.
     far = result.mask[0, 0] & ((y < 14) | (y > 46))
     assert bool(result.inlier[0, 0][far].all())

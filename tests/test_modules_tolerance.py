@@ -125,7 +125,7 @@ def test_score_matches_returns_what_the_scores_rest_on() -> None:
         found = score_matches(matches, ts.FilterConfig(score=score, max_error_px=2))
         assert found.cumulative.shape == (153, 5)
         assert torch.equal(found.score, found.cumulative[:, 2])
-        assert found.alignment.coefficients.shape == (4, 3)
+        assert found.alignment.coefficients.shape == (4, 4)
         assert found.domain.shape == (4,)
     found = score_matches(matches, ts.FilterConfig(score="topology", threshold=0.5))
     assert found.cumulative is found.alignment is found.domain is None

@@ -5,7 +5,7 @@ Beside them stand peers that look at the coordinates alone.
     python benchmarks/accuracy/domains.py --training-data TRAINING_DATA --folds WORK
 
 The eight scenes of the paper are scored by the shipped weights, which never saw them; scenes of the training set by the
-network of the cross-validation that was trained without them, and without the other frames of their drive.
+network of the cross-validation that was trained without them, and without frames of KITTI that look alike.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from training.work_folder import load_fold_networks
 PEERS = ("LPM", "libviso2 support", "disparity median, Delaunay")
 KINDS = tuple((detector, gated) for detector in ("sift", "fast", "gftt") for gated in (False, True))
 SCORES = ("consensus", "learned, no images", "learned")
-MOVES = ((8.0, 0.02), (-8.0, -0.02), (3.0, 0.0))  # rows of view 1 at y + a + b x
+MOVES = ((8.0, 0.02), (-8.0, -0.02), (3.0, 0.0))  # rows of view 1 at y1 + a + b x1
 
 
 class Case(NamedTuple):
@@ -68,7 +68,7 @@ def score_coordinates(found: Putatives) -> dict[str, torch.Tensor]:
 def move_rows(given: Putatives, a: float, b: float) -> Putatives:
     """The same matches, view 1 as a rig would give it that is not quite calibrated."""
     points1 = given.points1.copy()
-    points1[:, 1] += a + b * given.points0[:, 0]
+    points1[:, 1] += a + b * given.points1[:, 0]
     return replace(given, points1=points1)
 
 
@@ -82,6 +82,13 @@ def rank(cases: Iterable[Case], name: str, k: int, *, rows_count: bool = True) -
             counts = roc_update(cumulative[name][:, k], correct, valid=valid)
             figures.append((counts.auc(), counts.specificity_at(PAPER_SENSITIVITY)))
     return np.array(figures).reshape(-1, 2)
+
+
+def _held_out(scene: str) -> int:
+    fold = fold_of(scene)
+    if fold is None:
+        raise ValueError(f"no network was trained without {scene}")
+    return fold
 
 
 def report(suite: Suite, group: str, kind: str, cases: list[Case], least_px: float) -> None:
@@ -113,7 +120,7 @@ def report_moved(suite: Suite, kind: str, cases: list[Case], network: LearnedSco
         for name in SCORES[:2]:
             change = torch.cat([(m.cumulative[name] - c.cumulative[name])[:, one] for m, c in zip(moved, cases)])  # noqa: B905
             before, after = (rank(x, name, one).mean(0)[0] for x in (cases, moved))
-            title = f"eight moved by {a:g} + {b:g} x, {kind}, {name}"
+            title = f"eight moved by {a:g} + {b:g} x1, {kind}, {name}"
             suite.note(title, auc_change=after - before, median_change=float(change.abs().median()))
 
 
@@ -135,8 +142,7 @@ def main() -> None:
         for detector, gated in KINDS:
             kind = f"{detector}{' g' if gated else ''}"
             found = [find_putatives(pair, detector, gated=gated) for pair in pairs]
-            held = [None if group == "eight" else fold_of(one.scene) for one in found]
-            networks = [shipped if fold is None else folds[fold] for fold in held]
+            networks = [shipped if group == "eight" else folds[_held_out(one.scene)] for one in found]
             cases = [
                 Case(one, score(one, network) | score_coordinates(one))
                 for one, network in zip(found, networks, strict=True)

@@ -1,7 +1,8 @@
 """Putative matches with truth for the training of the learned score, under many settings.
 
 Real scenes are taken as they are under six fixed settings; all are altered at random: mirrored, resized, cropped,
-blurred, with other exposure, and with rows that do not agree. Seeds follow from scene and variant alone.
+blurred, with other exposure, and with rows that do not agree. Seeds follow from the variant and from the place of the
+scene in the list.
 """
 
 from __future__ import annotations

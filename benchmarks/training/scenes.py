@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.scenes import EIGHT
 from tensor_stereo.configs import SyntheticConfig
 from tensor_stereo.datasets import PairFiles, find_pairs, read_disparity_png, read_pair, read_pfm
 from tensor_stereo.datasets.synthetic.rendering import render_scene
@@ -27,6 +28,7 @@ _DOMAINS = {
     "eth3d": "eth3d",
     "kitti-2015": "kitti",
 }
+_EXAM = {name.lower() for name in EIGHT} | {"artl"}
 KITTI_LEAST_PX = 2.0  # its truth is off by about half a pixel: labels of smaller tolerances are masked
 _KITTI_BLOCKS = (range(7), range(7, 18), range(22, 34))  # frames of drives that look alike; the rest is the last fold
 FOLDS = (
@@ -68,7 +70,7 @@ def list_scenes(data: Path, more: Path | None) -> list[Scene]:
     for root in (data, more):
         for files in find_pairs(root) if root is not None else ():
             domain = _DOMAINS.get(files.dataset)
-            if domain is not None:
+            if domain is not None and files.scene.lower() not in _EXAM:  # MiddEval3 has some of them, in other sizes
                 scenes.append(Scene(files.scene, domain, fold_of(files.scene), files))
     scenes += [Scene(*found) for found in _rendered(more)] if more is not None else []
     scenes += [Scene(f"synthetic-{k}", "synthetic", None, k) for k in range(NUM_SYNTHETIC)]

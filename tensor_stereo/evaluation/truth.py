@@ -28,7 +28,7 @@ def errors_against_gt(matches: Matches, disparity_gt: Tensor | Sequence[Tensor])
             and infinite values are unknown; 0 is a disparity.
 
     Returns:
-        (M,) float64 px of view 0, NaN where ground truth is unknown.
+        (M,) float64 px of view 0, NaN where ground truth is unknown; infinite for a keypoint that is no number.
 
     Raises:
         ValueError: if there is not one map per pair, or a keypoint lies more than 1 px outside its image.
@@ -53,8 +53,9 @@ def errors_against_gt(matches: Matches, disparity_gt: Tensor | Sequence[Tensor])
     disparity, rows = (matches.keypoints0.detach().double() - matches.keypoints1.detach().double()).unbind(1)
     error = torch.where(truth.isfinite(), (truth - disparity).abs(), torch.nan)
     near = (error <= _ALIGNING_PX) & rows.isfinite()
-    shift = fit_alignment(matches, near).row_shift(matches.keypoints0, matches.ptr)
-    return torch.maximum(error, (rows + shift).abs())
+    shift = fit_alignment(matches, near).row_shift(matches)
+    error = torch.maximum(error, (rows + shift).abs())
+    return torch.where(truth.isfinite(), error.nan_to_num(nan=torch.inf), torch.nan)
 
 
 def matches_against_gt(

@@ -281,8 +281,8 @@ def _index_variant(rows: Sequence[Row], verdict: Verdict, variant: str) -> dict[
 
 def _tolerance(rows: Sequence[Row]) -> str:
     """What counts as correct, for a title; nothing at the paper's 1 px."""
-    found = sorted({row.get("max_error_px", 1.0) for row in rows} - {1.0})
-    return f", correct within {' or '.join(f'{value:g}' for value in found)} px" if found else ""
+    found = sorted({row.get("max_error_px", 1.0) for row in rows})
+    return "" if found in ([], [1.0]) else f", correct within {' or '.join(f'{value:g}' for value in found)} px"
 
 
 def _with_mean(body: Sequence[tuple[Cell, ...]]) -> tuple[tuple[Cell, ...], ...]:

@@ -23,17 +23,20 @@ _LEAST_VOTES = 3  # of neighbours, counted in each view
 _ROW_PX, _DISPARITY_PX, _SLOPE = 1.0, 2.0, 0.2  # how far two neighbours that agree may differ, the last per px of way
 _MAX_OFFSET_PX, _BIN_PX = 256, 2  # the first guess of the offset is the middle of the fullest bins
 _SCALES_PX = (6.0, 3.0, 1.5, 0.8, 0.5)  # of the noise, round by round
-_SLOPE_PRIOR = 0.02  # standard deviation of the drift, px/px
+_SLOPE_PRIOR, _TILT_PRIOR = 0.02, 0.005  # standard deviations of the drift, and of that with the disparity, px/px
 _LEAST_SHIFT_PX = 0.1  # what is smaller all over the pair is none
 _MAX_DRIFT = 0.05  # px/px; what drifts more is not rectified
 _FIT_PX = 1.5  # most of the matches that agree must lie that near to their rows
 
 
 class Alignment(NamedTuple):
-    """Where the rows of view 0 lie in view 1: ``y1 - y0 = a + b x0 + c y0`` for the matches that agree.
+    """Where the rows of view 0 lie in view 1: ``y1 - y0 = a + b x0 + c y0 + e d`` for the matches that agree.
+
+    With disparity d = x0 - x1 these are affine epipolar lines (Shapiro, Zisserman & Brady, IJCV 16, 1995), nearly along
+    the rows, whichever camera is turned; e alone is a baseline that is not level.
 
     Attributes:
-        coefficients: (B, 3) float64, a in px and b, c in px per px; zero where nothing was fitted.
+        coefficients: (B, 4) float64, a in px and b, c, e in px per px; zero where nothing was fitted.
         fitted: (B,) bool, whether at least 12 matches agree, and most of them lie within 1.5 px of rows that drift by
             at most 5 %. Where they do not, scores expect rows to be the same.
         num_agreeing: (B,) int64 matches that it was fitted to.
@@ -52,23 +55,23 @@ class Alignment(NamedTuple):
         """That of pairs ``start`` to ``stop - 1``."""
         return Alignment(*(values[start:stop] for values in self))
 
-    def row_shift(self, keypoints0: Tensor, ptr: Tensor) -> Tensor:
-        """(M,) float64 px, by how much the row of every match in view 1 is expected below that in view 0."""
-        a, b, c = self.coefficients.index_select(0, ptr_to_batch(ptr)).unbind(1)
-        x, y = keypoints0.detach().double().unbind(1)
-        return a + b * x + c * y
+    def row_shift(self, matches: Matches) -> Tensor:
+        """(M,) float64 px, how much lower the row of each match in view 1 is expected than in view 0; a constant."""
+        a, b, c, e = self.coefficients.index_select(0, ptr_to_batch(matches.ptr)).unbind(1)
+        x, y = matches.keypoints0.detach().double().unbind(1)
+        return a + b * x + c * y + e * (x - matches.keypoints1[:, 0].detach().double())
 
 
 def align_matches(matches: Matches, alignment: Alignment) -> Matches:
     """The matches with view 1 moved such that partners lie on one row. Gradients flow to the keypoints.
 
     >>> points = torch.tensor([[1.0, 2.0]])
-    >>> three_rows = torch.tensor([[3.0, 0.5, 0.0]], dtype=torch.float64)
+    >>> three_rows = torch.tensor([[3.0, 0.5, 0.0, 0.0]], dtype=torch.float64)
     >>> alignment = Alignment(three_rows, torch.tensor([True]), torch.tensor([40]))
     >>> align_matches(Matches(points, points, torch.tensor([0, 1])), alignment).keypoints1
     tensor([[ 1.0000, -1.5000]], dtype=torch.float64)
     """
-    shift = alignment.row_shift(matches.keypoints0, matches.ptr)
+    shift = alignment.row_shift(matches)
     moved = matches.keypoints1.double() - torch.stack([torch.zeros_like(shift), shift], 1)
     return Matches(matches.keypoints0.double(), moved, matches.ptr, matches.cost, matches.group)
 
@@ -99,7 +102,7 @@ def estimate_alignment(matches: Matches, graphs: MatchGraphs, *, backend: Backen
         >>> right[:60] = right[:60].flip(0)
         >>> matches = Matches(left, right, torch.tensor([0, 200]))
         >>> estimate_alignment(matches, build_match_graphs(matches)).coefficients.round(decimals=2)
-        tensor([[2.0000, 0.0100, 0.0000]], dtype=torch.float64)
+        tensor([[2.0000, 0.0100, 0.0000, 0.0000]], dtype=torch.float64)
     """
     check_match_graphs(matches, graphs)
     votes = ops.agreeing_neighbors(
@@ -138,33 +141,31 @@ def fit_alignment(matches: Matches, agreeing: Tensor) -> Alignment:
     >>> left = torch.rand(40, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
     >>> matches = Matches(left, left + torch.tensor([-5, 2]), torch.tensor([0, 40]))
     >>> fit_alignment(matches, torch.arange(40) < 20).coefficients.round(decimals=3)
-    tensor([[2., -0., -0.]], dtype=torch.float64)
+    tensor([[2., -0., -0., 0.]], dtype=torch.float64)
     """
     check_vector("agreeing", agreeing, matches.num_matches)
     check_mask("agreeing", agreeing)
-    num_pairs = matches.num_pairs
-    y = matches.keypoints0[:, 1].double()
-    offset = matches.keypoints1[:, 1].double() - y
     rows = agreeing.nonzero()[:, 0]
     batch = ptr_to_batch(matches.ptr).index_select(0, rows)
     pairs = _Rows(batch, functional.pad(agreeing.cumsum(0), (1, 0)).index_select(0, matches.ptr))
-    x, y, offset = (v.index_select(0, rows) for v in (matches.keypoints0[:, 0].double(), y, offset))
-    one = torch.ones_like(x)
+    left, right = (view.double().index_select(0, rows) for view in (matches.keypoints0, matches.keypoints1))
+    offset = right[:, 1] - left[:, 1]
+    one = torch.ones_like(offset)
     count = pairs.sum(one)
-    middle = [pairs.sum(values) / count.clamp(min=1) for values in (x, y)]
+    given = (left[:, 0], left[:, 1], left[:, 0] - right[:, 0])
+    middle = torch.stack([pairs.sum(values) / count.clamp(min=1) for values in given], 1)  # (B, 3)
     # from the middle, so that offset and drift hardly depend on each other
-    x, y = (values - mean.index_select(0, batch) for values, mean in zip((x, y), middle, strict=True))
-    fit = [_fullest(offset, one, batch, num_pairs), torch.zeros_like(count), torch.zeros_like(count)]
+    basis = [one, *(values - mean for values, mean in zip(given, middle.index_select(0, batch).unbind(1), strict=True))]
+    fit = functional.pad(_fullest(offset, one, batch, matches.num_pairs)[:, None], (0, 3))  # (B, 4)
     for scale_px in _SCALES_PX:
-        relative = (offset - _at(fit, x, y, batch)) / scale_px
-        fit = _solve(1 / (1 + relative.square()).square(), x, y, offset, scale_px, pairs)
-    fitted_offset = _at(fit, x, y, batch)
+        relative = (offset - _at(fit, basis, batch)) / scale_px
+        fit = _solve(1 / (1 + relative.square()).square(), basis, offset, scale_px, pairs)
+    fitted_offset = _at(fit, basis, batch)
     near = ((offset - fitted_offset).abs() <= _FIT_PX).to(one)
-    is_slow = (fit[1].abs() <= _MAX_DRIFT) & (fit[2].abs() <= _MAX_DRIFT)
+    is_slow = (fit[:, 1:].abs() <= _MAX_DRIFT).all(1)
     fitted = (count >= _LEAST_AGREEING) & is_slow & (2 * pairs.sum(near) >= count)
     largest = torch.zeros_like(count).scatter_reduce(0, batch, fitted_offset.abs(), "amax")
-    a, b, c = fit
-    coefficients = torch.stack([a - b * middle[0] - c * middle[1], b, c], 1)
+    coefficients = torch.cat([fit[:, :1] - (fit[:, 1:] * middle).sum(1, keepdim=True), fit[:, 1:]], 1)
     keep = fitted & (largest >= _LEAST_SHIFT_PX)
     return Alignment(torch.where(keep[:, None], coefficients, 0), fitted, count.long())
 
@@ -182,9 +183,9 @@ class _Rows(NamedTuple):
         return torch.segment_reduce(values, "sum", offsets=self.ptr)  # four times as fast
 
 
-def _at(fit: list[Tensor], x: Tensor, y: Tensor, batch: Tensor) -> Tensor:
-    a, b, c = (values.index_select(0, batch) for values in fit)
-    return a + b * x + c * y
+def _at(fit: Tensor, basis: list[Tensor], batch: Tensor) -> Tensor:
+    own = fit.index_select(0, batch).unbind(1)
+    return own[0] + own[1] * basis[1] + own[2] * basis[2] + own[3] * basis[3]
 
 
 def _fullest(offset: Tensor, weight: Tensor, batch: Tensor, num_pairs: int) -> Tensor:
@@ -197,15 +198,15 @@ def _fullest(offset: Tensor, weight: Tensor, batch: Tensor, num_pairs: int) -> T
     return (three.argmax(1) + 1.5) * _BIN_PX - _MAX_OFFSET_PX
 
 
-def _solve(weight: Tensor, x: Tensor, y: Tensor, offset: Tensor, scale_px: float, pairs: _Rows) -> list[Tensor]:
-    """Three (B,) coefficients by weighted least squares, by cofactors; a drift of zero counts as an observation."""
-    wx, wy = weight * x, weight * y
-    columns = (weight, wx, wy, wx * x, wx * y, wy * y, weight * offset, wx * offset, wy * offset)
-    one, sx, sy, sxx, sxy, syy, r0, rx, ry = (pairs.sum(column) for column in columns)
-    ridge = (scale_px / _SLOPE_PRIOR) ** 2
-    one, sxx, syy = one + 1e-9, sxx + ridge, syy + ridge
-    c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
-    c11, c12, c22 = one * syy - sy * sy, sx * sy - one * sxy, one * sxx - sx * sx
-    solved = (c00 * r0 + c01 * rx + c02 * ry, c01 * r0 + c11 * rx + c12 * ry, c02 * r0 + c12 * rx + c22 * ry)
-    determinant = one * c00 + sx * c01 + sy * c02
-    return [values / determinant for values in solved]
+def _solve(weight: Tensor, basis: list[Tensor], offset: Tensor, scale_px: float, pairs: _Rows) -> Tensor:
+    """(B, 4) coefficients by weighted least squares; a drift of zero counts as an observation."""
+    weighted = [weight * values for values in basis]
+    rows = [
+        [pairs.sum(weighted[min(k, m)] * basis[max(k, m)]) if k and m else pairs.sum(weighted[k + m]) for m in range(4)]
+        for k in range(4)
+    ]
+    normal = torch.stack([torch.stack(row, 1) for row in rows], 1)  # (B, 4, 4)
+    target = torch.stack([pairs.sum(values * offset) for values in weighted], 1)
+    slope, tilt = ((scale_px / prior) ** 2 for prior in (_SLOPE_PRIOR, _TILT_PRIOR))
+    fit: Tensor = torch.linalg.solve(normal + torch.diag(normal.new_tensor([1e-9, slope, slope, tilt])), target)
+    return fit

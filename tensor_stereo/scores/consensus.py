@@ -134,7 +134,7 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignm
     settings = config.consensus
     row_shift = None
     if settings.rectified and alignment is not None:
-        row_shift = alignment.row_shift(matches.keypoints0, matches.ptr)
+        row_shift = alignment.row_shift(matches)
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
         matches.keypoints1,

@@ -123,7 +123,7 @@ def measure_images(
     slope = estimate_slopes(matches, graphs)
     row_shift = matches.keypoints0.new_zeros(matches.num_matches).float()
     if alignment is not None:
-        row_shift = alignment.row_shift(matches.keypoints0, matches.ptr).float()
+        row_shift = alignment.row_shift(matches).float()
     width = max((count for _, count in ranges), default=0)
     parts = [_empty(matches.keypoints0, width)]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
@@ -173,7 +173,8 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
         if last - first >= MAX_DISPARITIES:
             ordered = believed.sort().values
             begin = ordered.floor() - _NEAR_PX
-            within = torch.searchsorted(ordered, begin + MAX_DISPARITIES - _NEAR_PX) - torch.arange(len(ordered))
+            within = torch.searchsorted(ordered, begin + MAX_DISPARITIES - _NEAR_PX)
+            within = within - torch.arange(len(ordered), device=ordered.device)
             first = int(begin[within.argmax()])
             last = first + MAX_DISPARITIES - 1
         ranges.append((first, last - first + 1))
@@ -253,14 +254,14 @@ def _measure_one(
     kernels = window_kernels(windows)
     whole = slice(0, NUM_WHOLE)
 
-    def compare(strips: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        cost, likeness, variance = compare_windows(windows, strips, kernels)
+    def compare(strips: Tensor, kernels: Tensor, *, has_tight: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        cost, likeness, variance = compare_windows(windows, strips, kernels, has_tight=has_tight)
         return (cost.flip(1), likeness.flip(1), variance) if reverse else (cost, likeness, variance)
 
     cost, likeness, variance = compare(sample_windows(other, partners, RADIUS_PX + _NEAR_PX), kernels)
     mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
     slanted = sample_slanted(other, partners, RADIUS_PX + _NEAR_PX, shear)
-    along, along_likeness, _ = compare(slanted, kernels[..., list(_SLANTED)])
+    along, along_likeness, _ = compare(slanted, kernels[..., list(_SLANTED)], has_tight=False)
     offset = lowest_place(along) * (1 + shear[:, :1])  # whose places are that far apart
     # the row of the window itself, but for the alignment: there lies a rectified partner
     toward = -1 if reverse else 1

@@ -93,18 +93,22 @@ def window_kernels(windows: Tensor) -> Tensor:
     return (weights / weights.sum(2, keepdim=True)).transpose(1, 2)
 
 
-def compare_windows(windows: Tensor, strips: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def compare_windows(
+    windows: Tensor, strips: Tensor, kernels: Tensor, *, has_tight: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Log zero-mean SSD (m, D, K), correlation (m, D, K), and log variance of the windows (m, K).
 
-    Where the kernel :data:`TIGHT` is among the K, its SSD also counts how far the means differ.
+    No gradient.
 
     Args:
         windows: (m, 15, 15).
         strips: (m, 15, D + 14): D windows, each one column on.
         kernels: (m, 225, K) weights.
+        has_tight: Whether they are the first ones of :func:`window_kernels`, with :data:`TIGHT` among them, whose SSD
+            also counts how far the means differ.
 
     >>> windows = torch.rand(1, 15, 15)
-    >>> compare_windows(windows, windows, window_kernels(windows))[0].exp().round()
+    >>> compare_windows(windows, windows, window_kernels(windows), has_tight=True)[0].exp().round()
     tensor([[[2., 2., 2., 2., 2., 2., 2., 2.]]])
     """
     side, k = windows.shape[1], kernels.shape[2]
@@ -119,7 +123,7 @@ def compare_windows(windows: Tensor, strips: Tensor, kernels: Tensor) -> tuple[T
     variance = (squares - mean.square()).clamp(min=0)
     covariance = product - mean * anchor_mean[:, None]
     difference = (variance + anchor_variance[:, None] - 2 * covariance).clamp(min=0)
-    if k > TIGHT:
+    if has_tight:
         difference[..., TIGHT] += (mean[..., TIGHT] - anchor_mean[:, None, TIGHT]).square()
     scale = (variance + NOISE_VARIANCE) * (anchor_variance[:, None] + NOISE_VARIANCE)
     return torch.log(difference + NOISE_VARIANCE), covariance / scale.sqrt(), torch.log(anchor_variance + 1)

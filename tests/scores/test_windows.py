@@ -41,7 +41,7 @@ def test_tight_windows_keep_to_one_side_of_an_edge() -> None:
 
 def test_only_the_tight_window_sees_that_all_is_brighter() -> None:
     windows = torch.rand(3, 15, 15, generator=torch.Generator().manual_seed(0)) * 100
-    log_ssd, likeness, _ = compare_windows(windows, windows + 9, window_kernels(windows))
+    log_ssd, likeness, _ = compare_windows(windows, windows + 9, window_kernels(windows), has_tight=True)
     others = [k for k in range(log_ssd.shape[2]) if k != TIGHT]
     np.testing.assert_allclose(log_ssd[..., others].exp(), 2, atol=0.02)  # the noise alone
     np.testing.assert_allclose(log_ssd[..., TIGHT].exp(), 83, rtol=1e-3)

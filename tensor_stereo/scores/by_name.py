@@ -63,7 +63,8 @@ def score_matches(
             in one pass with the pairs that it needs, whether they are given or not.
         images: The B images of view 0 and those of view 1, at which ``learned`` looks, as
             :func:`tensor_stereo.scores.image_evidence.measure_images` takes them.
-        evidence: What the images say, if that was measured before; instead of ``images``.
+        evidence: What the images say, if that was measured before; instead of ``images``. Nobody checks then whether
+            the keypoints lie in them.
         alignment: Where the rows of view 0 lie in view 1, which ``consensus`` and ``learned`` take out; None: it is
             estimated for rectified pairs.
         temperature: () of ``topology``, in place of that of the settings, for gradients.

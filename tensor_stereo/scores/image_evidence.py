@@ -128,7 +128,7 @@ def measure_images(
     parts = [_empty(matches.keypoints0, width)]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
         for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
-            gray = [to_gray(images[b][None])[0, 0].float() for images in views]
+            gray = [to_gray(images[b][None])[0, 0].float().to(matches.ptr.device) for images in views]
             gray[1] = gray[1] - _brighter(gray, *(k[start:stop] for k in (matches.keypoints0, matches.keypoints1)))
             for row in range(start, stop, _ROWS_AT_ONCE):
                 rows = slice(row, min(row + _ROWS_AT_ONCE, stop))

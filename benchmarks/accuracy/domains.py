@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,13 +51,12 @@ class Case(NamedTuple):
 def score(found: Putatives, network: LearnedScore, *, images: bool = True) -> dict[str, torch.Tensor]:
     """The probabilities (M, 5) of every score, with costs."""
     matches = to_matches([found], with_cost=True)
-    plain = {
-        name: score_matches(matches, FilterConfig(score=kind), network=network).cumulative
-        for name, kind in (("consensus", "consensus"), ("learned, no images", "learned"))
-    }
+    consensus = score_matches(matches, FilterConfig(score="consensus"))
+    learned = partial(score_matches, matches, graphs=consensus.graphs, alignment=consensus.alignment, network=network)
+    scores = {"consensus": consensus.cumulative, "learned, no images": learned().cumulative}
     if images:
-        plain["learned"] = score_matches(matches, images=tuple(to_images([found])), network=network).cumulative
-    return plain
+        scores["learned"] = learned(images=tuple(to_images([found]))).cumulative
+    return scores
 
 
 def score_coordinates(found: Putatives) -> dict[str, torch.Tensor]:
@@ -118,7 +118,9 @@ def report_moved(suite: Suite, kind: str, cases: list[Case], network: LearnedSco
     for a, b in MOVES:
         moved = [Case(c.found, score(move_rows(c.found, a, b), network, images=False)) for c in cases]
         for name in SCORES[:2]:
-            change = torch.cat([(m.cumulative[name] - c.cumulative[name])[:, one] for m, c in zip(moved, cases)])  # noqa: B905
+            change = torch.cat(
+                [(m.cumulative[name] - c.cumulative[name])[:, one] for m, c in zip(moved, cases, strict=True)]
+            )
             before, after = (rank(x, name, one).mean(0)[0] for x in (cases, moved))
             title = f"eight moved by {a:g} + {b:g} x1, {kind}, {name}"
             suite.note(title, auc_change=after - before, median_change=float(change.abs().median()))
@@ -138,6 +140,7 @@ def main() -> None:
         "KITTI": groups["kitti"],
     }
     for group, pairs in named.items():
+        least_px = KITTI_LEAST_PX if group == "KITTI" else 0
         totals = []
         for detector, gated in KINDS:
             kind = f"{detector}{' g' if gated else ''}"
@@ -147,13 +150,13 @@ def main() -> None:
                 Case(one, score(one, network) | score_coordinates(one))
                 for one, network in zip(found, networks, strict=True)
             ]
-            report(suite, group, kind, cases, KITTI_LEAST_PX if group == "KITTI" else 0)
+            report(suite, group, kind, cases, least_px)
             if group == "eight":
                 report_moved(suite, kind, cases, shipped)
             totals.append(cases)
         for name in (*PEERS, *SCORES):
             for k, tolerance in enumerate(TOLERANCES_PX):
-                if tolerance >= (KITTI_LEAST_PX if group == "KITTI" else 0):
+                if tolerance >= least_px:
                     auc, specificity = np.mean([rank(cases, name, k).mean(0) for cases in totals], 0)
                     title = f"{group}, mean of the six kinds, {name}, {tolerance:g} px"
                     suite.note(title, auc=auc, specificity_at_96=specificity)

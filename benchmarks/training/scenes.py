@@ -37,7 +37,6 @@ FOLDS = (
     ("Cloth1", "Lampshade1", "sawtooth", "Recycle", "playground_1l"),
     ("Flowerpots", "Rocks1", "Wood1", "barn1"),
 )  # each network of the cross-validation is trained without the scenes, and without the drives, of one fold
-
 NUM_FOLDS = len(FOLDS)
 
 
@@ -64,15 +63,15 @@ class Scene(NamedTuple):
         return KITTI_LEAST_PX if self.domain == "kitti" else 0.0
 
 
-def list_scenes(data: Path, more: Path | None) -> list[Scene]:
+def list_scenes(data: Path, more: Path) -> list[Scene]:
     """All scenes below two folders, without the paper's, and the synthetic ones."""
     scenes = []
     for root in (data, more):
-        for files in find_pairs(root) if root is not None else ():
+        for files in find_pairs(root):
             domain = _DOMAINS.get(files.dataset)
             if domain is not None and files.scene.lower() not in _EXAM:  # MiddEval3 has some of them, in other sizes
                 scenes.append(Scene(files.scene, domain, fold_of(files.scene), files))
-    scenes += [Scene(*found) for found in _rendered(more)] if more is not None else []
+    scenes += [Scene(*found) for found in _rendered(more)]
     scenes += [Scene(f"synthetic-{k}", "synthetic", None, k) for k in range(NUM_SYNTHETIC)]
     return scenes
 

@@ -163,8 +163,10 @@ class MessageRound(nn.Module):
         if with_image:
             to_i, to_j = to_i.add_(self.edge_image(q.image_i)), to_j.add_(self.edge_image(q.image_j))
         heard = q.receivers.sum(to_i.relu_(), to_j.relu_()) / q.degree
-        trust = torch.sigmoid(belief)
-        known = [state, heard, plane_columns(trust, q, refined=False)] if self.plane else [state, heard]
+        known = [state, heard]
+        if self.plane:
+            trust = torch.sigmoid(belief)
+            known.append(plane_columns(trust, q, refined=False))
         mixed = self.mix(torch.cat(known, 1)) + self.whole(_pair_mean(state, q)).index_select(0, q.batch)
         if self.mix_refined is not None and with_image:
             mixed = mixed + self.mix_refined(plane_columns(trust, q, refined=True) * q.has_image)

@@ -14,7 +14,7 @@ from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import CUTS, TrialConfig
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, roc_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
-from tensor_stereo.evaluation.truth import matches_against_gt
+from tensor_stereo.evaluation.truth import errors_against_gt
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
@@ -153,7 +153,6 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
     keys: dict[str, Hashable] = {"detect": (trial.detector, features)}
     keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
     keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed
-    keys["truth"] = keys["perturb"], trial.max_error_px
     if trial.constrained:
         keys["label"] = trial.objects  # of the images alone
     keys["group"] = keys["perturb"], trial.objects if trial.constrained else None
@@ -216,9 +215,8 @@ class TrialRunner:
 
         features = share("detect", lambda: detect_pairs(self._gray, trial))
         putative = share("match", lambda: match_features(*features, trial))
-        matches = share("perturb", lambda: self._perturb(putative, trial))
-        correct, valid = share("truth", lambda: self._judge(matches, trial))
-        seconds["perturb"] += seconds.pop("truth")
+        matches, error_px = share("perturb", lambda: self._perturb(putative, trial))
+        correct, valid = error_px <= trial.max_error_px, ~error_px.isnan()
         if trial.constrained:
             labels = share("label", lambda: [label_objects(image, trial.objects) for image in self._gray[0]])
             matches = share("group", lambda: replace(matches, group=group_matches(matches, *labels)))
@@ -240,8 +238,8 @@ class TrialRunner:
             domain = None if found.domain is None else int(found.domain)
         return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, domain, seconds)
 
-    def _perturb(self, matches: Matches, trial: TrialConfig) -> Matches:
-        """The matches as the setting wants them."""
+    def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor]:
+        """The matches as the setting wants them, and how far they are from ground truth, NaN where it is unknown."""
         name = f"{trial.seed}/{self.pair.dataset}/{scene_name(self.pair)}"
         seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") >> 1
         generator = torch.Generator().manual_seed(seed)
@@ -250,14 +248,9 @@ class TrialRunner:
         if trial.noise_px:
             height, width = self.pair.image0.shape[1:]
             matches = add_noise(matches, trial.noise_px, generator, [(height, width)])
-        return matches
-
-    def _judge(self, matches: Matches, trial: TrialConfig) -> tuple[Tensor, Tensor]:
-        """Which matches are correct by ground truth, and of which it is known."""
         if self.pair.disparity_gt is None:
-            unknown = torch.zeros(matches.num_matches, dtype=torch.bool)
-            return unknown, unknown
-        return matches_against_gt(matches, [self.pair.disparity_gt], max_error_px=trial.max_error_px)
+            return matches, torch.full((matches.num_matches,), torch.nan)
+        return matches, errors_against_gt(matches, [self.pair.disparity_gt])
 
 
 def scene_name(pair: StereoPair) -> str:

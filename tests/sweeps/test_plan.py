@@ -65,7 +65,7 @@ def test_costs_are_what_a_runner_does(
 
     counted = dict.fromkeys(STAGES, 0)
     stages = {
-        "detect": "detect_pairs", "match": "match_features", "perturb": "matches_against_gt",
+        "detect": "detect_pairs", "match": "match_features", "perturb": "errors_against_gt",
         "group": "group_matches", "graph": "build_match_graphs", "relate": "classify_graphs", "score": "score_pairs",
     }  # fmt: skip
     for stage, name in stages.items():

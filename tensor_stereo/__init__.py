@@ -9,7 +9,6 @@ from tensor_stereo.lazy import attach
 
 if TYPE_CHECKING:
     from tensor_stereo.classification import classify_matches as classify_matches
-    from tensor_stereo.configs import UNRECTIFIED as UNRECTIFIED
     from tensor_stereo.configs import ConsensusConfig as ConsensusConfig
     from tensor_stereo.configs import EvaluationConfig as EvaluationConfig
     from tensor_stereo.configs import FilterConfig as FilterConfig
@@ -58,7 +57,6 @@ __getattr__, __dir__, __all__ = attach(
         "PipelineOutput": "pipeline",
         "Relation": "types",
         "StereoPair": "types",
-        "UNRECTIFIED": "configs",
         "backend": "ops.backends",
         "build_graphs": "graphs",
         "classify_files": "reports.pair",

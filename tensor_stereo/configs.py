@@ -16,6 +16,7 @@ Score = Literal["topology", "consensus", "learned"]
 ResolvedScore = Literal["none", Score]  # none: no score, and no curve in the results
 ScoreName = Literal["auto", ResolvedScore]
 Backend = Literal["auto", "native", "scipy"]
+Rectified = Literal[True, False, "auto"]
 
 RESTRICTIONS: tuple[Restriction, ...] = get_args(Restriction)
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
@@ -125,7 +126,7 @@ class ConsensusConfig:
 
     tolerance_px: Positive = 0.6  # difference to a neighbour's plane at which agreement has fallen to exp(-1/2)
     whole_tolerance_px: Positive = 1.0  # the same for keypoints on whole pixels
-    row_tolerance_px: Positive | None = 0.25  # row offset that halves the odds; None: the pair is not rectified
+    row_tolerance_px: Positive = 0.25  # offset from the row, or from the epipolar line, that halves the odds
     whole_row_tolerance_px: Positive = 1.5  # the same for keypoints on whole pixels
     slope: Positive = 0.2  # expected change of the displacement per px of distance, px/px
     reach: Positive = 2.0  # distance, in edge lengths around the match, at which a neighbour's vote counts half
@@ -135,14 +136,6 @@ class ConsensusConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, prefix="ConsensusConfig.")
-
-    @property
-    def rectified(self) -> bool:
-        """Whether the offset between the rows of a match is evidence."""
-        return self.row_tolerance_px is not None
-
-
-UNRECTIFIED = ConsensusConfig(row_tolerance_px=None)  # for pairs of any two views
 
 
 @dataclass(frozen=True)
@@ -157,9 +150,12 @@ class FilterConfig:
     probability, and needs an explicit ``threshold``. A match is correct, and a probability is that of it, if its error
     is at most ``max_error_px``, in px of view 0.
 
-    ``auto`` stands for ``learned`` under the verdict ``score`` (for ``consensus`` where its settings say that the pairs
-    are not rectified), and for no score under the verdicts of the paper, so that nobody pays for what is not asked. In
-    :class:`tensor_stereo.DelaunayFilter` it stands for ``topology`` under the verdicts of the paper.
+    ``auto`` stands for ``learned`` under the verdict ``score``, and for no score under the verdicts of the paper, so
+    that nobody pays for what is not asked. In :class:`tensor_stereo.DelaunayFilter` it stands for ``topology`` under the
+    verdicts of the paper.
+
+    ``consensus`` and ``learned`` take out what all matches of a pair share: the row offset of rectified pairs, whose
+    partners lie on one row; of others rotation, scale and perspective, with the epipolar lines in the place of rows.
 
     Raises:
         ValueError: if a value lies outside of its limits, or settings contradict each other.
@@ -172,6 +168,7 @@ class FilterConfig:
     target_sensitivity: Fraction | None = None  # fraction of the incorrect matches that are rejected, at least
     min_precision: Fraction | None = None  # fraction of the kept matches that are correct, at least
     max_error_px: Tolerance = 1.0  # a match is correct iff its error is at most that; a score is the probability of it
+    rectified: Rectified = True  # whether partners lie on one row; auto: the matches of each pair tell
     min_group_size: Annotated[int, Within(1, 2**31 - 1)] = 4  # distinct matches below which a group says nothing
     tie_tolerance: Annotated[float, Within(0, 1, open_high=True)] = 1e-3  # in edge lengths
     temperature: Annotated[float, Within(COLDEST, HOTTEST)] = 1.0  # of the score topology
@@ -200,9 +197,7 @@ class FilterConfig:
         """
         if self.score != "auto":
             return self.score
-        if self.verdict != "score":
-            return "none"
-        return "learned" if self.consensus.rectified else "consensus"
+        return "learned" if self.verdict == "score" else "none"
 
     @property
     def is_probability(self) -> bool:
@@ -220,45 +215,9 @@ def _check_cuts(config: FilterConfig) -> list[str]:
 
 @dataclass(frozen=True)
 class FileFilterConfig(FilterConfig):
-    """What decides about the matches of a file, whose form can choose the verdict.
+    """What decides about the matches of a file, whose pairs need not be rectified."""
 
-    ``verdict=None`` stands for ``cardinality`` in files of other matchers, of hloc and COLMAP, whose pairs need not be
-    rectified, and for ``score`` in all others.
-    """
-
-    verdict: Verdict | None = None  # type: ignore[assignment]
-    """what decides; None: the score, but cardinality in files of other matchers, .h5 and .db"""
-
-    def __post_init__(self) -> None:
-        if self.verdict is None:
-            check_settings(self)
-            _check_cuts(self)
-        else:
-            super().__post_init__()
-
-    def resolve(self, *, rectified: bool) -> FilterConfig:
-        """The settings for a file.
-
-        Files of pairs that are not rectified get a ``consensus`` score, unless a score or a verdict of the paper is
-        named. That score looks at no row offset there, unless ``row_tolerance_px`` differs from its default.
-
-        Args:
-            rectified: Whether the form of the file promises rectified pairs.
-
-        Raises:
-            ValueError: if settings contradict the verdict of the file.
-
-        >>> FileFilterConfig().resolve(rectified=False).verdict
-        'cardinality'
-        """
-        settings = {f.name: getattr(self, f.name) for f in fields(FilterConfig)}
-        if self.verdict is None:
-            settings["verdict"] = "score" if rectified else "cardinality"
-        if not rectified and self.score == "auto" and self.verdict not in RESTRICTIONS:
-            settings["score"] = "consensus"
-        if not rectified and self.consensus.row_tolerance_px == ConsensusConfig().row_tolerance_px:
-            settings["consensus"] = replace(self.consensus, row_tolerance_px=None)
-        return FilterConfig(**settings)
+    rectified: Rectified = "auto"  # whether partners lie on one row; auto: the matches of each pair tell
 
 
 def describe_verdict(settings: Mapping[str, Any]) -> str:

@@ -101,7 +101,7 @@ def _check(name: str, value: Any, hint: Any) -> None:
         _check(name, value, Annotated[hint, *limits] if limits else hint)
         return
     if get_origin(hint) is Literal:
-        if value not in get_args(hint):
+        if not any(value == one and isinstance(value, type(one)) for one in get_args(hint)):  # 1 is not True
             raise LimitError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}, got {value!r}")
         return
     if get_origin(hint) is tuple:

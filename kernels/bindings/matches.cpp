@@ -34,15 +34,16 @@ auto relate(Integers overlap, Integers degree0, Integers degree1, Integers group
 }
 
 auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::optional<Doubles> cost,
-                      std::optional<Doubles> row_shift, Integers crow0, Integers cols0, Integers crow1, Integers cols1,
-                      double tolerance, double whole_tolerance, std::optional<double> row_tolerance,
+                      std::optional<Doubles> row_offset, std::optional<Points> found1, Integers crow0, Integers cols0,
+                      Integers crow1, Integers cols1, double tolerance, double whole_tolerance, double row_tolerance,
                       double whole_row_tolerance, double slope, double reach, double doubt, double cost_weight,
                       int num_rounds, int num_threads) {
     const std::size_t num_matches = keypoints0.shape(0);
     const auto num_rows = static_cast<std::int64_t>(num_matches);
     check(keypoints1.shape(0) == num_matches, "keypoints0 and keypoints1 must have the same length");
     check(!cost || cost->shape(0) == num_matches, "cost must have one entry per match");
-    check(!row_shift || row_shift->shape(0) == num_matches, "row_shift must have one entry per match");
+    check(!row_offset || row_offset->shape(0) == num_matches, "row_offset must have one entry per match");
+    check(!found1 || found1->shape(0) == num_matches, "found1 must have one row per match");
     check_offsets(ptr, num_rows, "ptr must rise from 0 to the number of matches");
     check(crow0.shape(0) == num_matches + 1 && crow1.shape(0) == num_matches + 1, "crow must have one row per match");
     check_offsets(crow0, static_cast<std::int64_t>(cols0.shape(0)), "crow0 must rise from 0 to the length of cols0");
@@ -57,7 +58,8 @@ auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::o
                               ptr.data(),
                               static_cast<std::int64_t>(ptr.shape(0)) - 1,
                               cost ? cost->data() : nullptr,
-                              row_shift ? row_shift->data() : nullptr,
+                              row_offset ? row_offset->data() : nullptr,
+                              {keypoints0.data(), (found1 ? *found1 : keypoints1).data()},
                               {crow0.data(), crow1.data()},
                               {cols0.data(), cols1.data()}},
                              {tolerance, whole_tolerance, row_tolerance, whole_row_tolerance, slope, reach, doubt,
@@ -68,7 +70,7 @@ auto consensus_belief(Points keypoints0, Points keypoints1, Integers ptr, std::o
 }
 
 auto agreeing_neighbors(Points points0, Points points1, Integers crow0, Integers cols0, Integers crow1, Integers cols1,
-                        double row_px, double disparity_px, double slope, int num_threads) {
+                        double row_px, double disparity_px, double slope, double spread, int num_threads) {
     const std::size_t num_matches = points0.shape(0);
     const auto num_rows = static_cast<std::int64_t>(num_matches);
     check(points1.shape(0) == num_matches, "keypoints0 and keypoints1 must have the same length");
@@ -81,7 +83,7 @@ auto agreeing_neighbors(Points points0, Points points1, Integers crow0, Integers
     {
         const nb::gil_scoped_release release;
         ts::agreeing_neighbors(points0.data(), points1.data(), crow0.data(), cols0.data(), crow1.data(), cols1.data(),
-                               num_rows, row_px, disparity_px, slope, num_threads, count.get());
+                               num_rows, row_px, disparity_px, slope, spread, num_threads, count.get());
     }
     return give(std::move(count), num_matches);
 }
@@ -128,7 +130,7 @@ void bind_matches(nb::module_& module) {
     module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),
                nb::arg("min_group_size"), nb::arg("accept_subsets"));
     module.def("consensus_belief", &consensus_belief, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("ptr"),
-               nb::arg("cost").none(), nb::arg("row_shift").none(), nb::arg("crow0"), nb::arg("cols0"),
+               nb::arg("cost").none(), nb::arg("row_offset").none(), nb::arg("found1").none(), nb::arg("crow0"), nb::arg("cols0"),
                nb::arg("crow1"), nb::arg("cols1"), nb::arg("tolerance"), nb::arg("whole_tolerance"),
                nb::arg("row_tolerance").none(), nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"),
                nb::arg("doubt"), nb::arg("cost_weight"), nb::arg("num_rounds"), nb::arg("num_threads"));

@@ -79,14 +79,15 @@ double grid_share(const Value& value, std::int64_t begin, std::int64_t end) noex
     return std::hypot(real / count, imaginary / count);
 }
 
-// The product over the x and y of both views; rows of view 1 as they are or without the shift, if that is more.
+// The product over the x and y of both views; rows of view 1 as they are or without what their pair shares, if that is
+// more.
 double whole_pixels(const ConsensusMatches& matches, std::int64_t begin, std::int64_t end) noexcept {
     const auto share = [&](int view, int axis) {
-        return grid_share([&](std::int64_t row) { return matches.keypoints[view][2 * row + axis]; }, begin, end);
+        return grid_share([&](std::int64_t row) { return matches.found[view][2 * row + axis]; }, begin, end);
     };
     double last = share(1, 1);
-    if (matches.row_shift != nullptr) {
-        const auto moved = [&](std::int64_t row) { return matches.keypoints[1][2 * row + 1] - matches.row_shift[row]; };
+    if (matches.row_offset != nullptr) {
+        const auto moved = [&](std::int64_t row) { return matches.found[0][2 * row + 1] - matches.row_offset[row]; };
         last = std::max(last, grid_share(moved, begin, end));
     }
     return share(0, 0) * share(0, 1) * share(1, 0) * last;
@@ -118,7 +119,7 @@ class Consensus {
             }
         }
         std::fill(odds_.get() + begin, odds_.get() + end, 0.0);  // evidence, until its exponential is taken
-        if (settings_.row_tolerance) add_row_offsets(begin, end, whole);
+        if (matches_.row_offset != nullptr) add_row_offsets(begin, end, whole);
         if (matches_.cost != nullptr) add_costs(begin, end, belief);
         for (std::int64_t row = begin; row < end; ++row) {
             odds_[row] = std::exp(std::min(std::max(odds_[row], -kMaxEvidence), kMaxEvidence));
@@ -174,12 +175,10 @@ class Consensus {
 
    private:
     void add_row_offsets(std::int64_t begin, std::int64_t end, double whole) noexcept {
-        const double narrow = *settings_.row_tolerance;
+        const double narrow = settings_.row_tolerance;
         const double tolerance = narrow + (settings_.whole_row_tolerance - narrow) * whole;
         for (std::int64_t row = begin; row < end; ++row) {
-            double offset = matches_.keypoints[0][2 * row + 1] - matches_.keypoints[1][2 * row + 1];
-            if (matches_.row_shift != nullptr) offset += matches_.row_shift[row];
-            offset /= tolerance;
+            const double offset = matches_.row_offset[row] / tolerance;
             odds_[row] -= std::log1p(offset * offset);
         }
     }

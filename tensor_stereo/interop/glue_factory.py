@@ -15,7 +15,6 @@ import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.modules import DelaunayFilter, FilterOutput
 from tensor_stereo.types import Matches, check_mask, check_tensor, check_vector
 
@@ -145,16 +144,15 @@ def _write_view(
 def two_view_filter(**settings: Any) -> DelaunayFilter:
     """The default filter for matches of any two views, which need not be rectified.
 
-    Its verdict is ``cardinality``, Restriction 2 of the paper, and its score is ``consensus`` without row offsets.
+    It is a :class:`~tensor_stereo.DelaunayFilter` that looks at every pair whether it is rectified.
 
     Args:
         **settings: Settings of :class:`~tensor_stereo.DelaunayFilter` in place of these.
 
-    >>> two_view_filter().config.verdict
-    'cardinality'
+    >>> two_view_filter().config.verdict, two_view_filter().config.rectified
+    ('score', 'auto')
     """
-    defaults: dict[str, Any] = {"verdict": "cardinality", "score": "consensus", "consensus": UNRECTIFIED}
-    return DelaunayFilter(**defaults | settings)
+    return DelaunayFilter(**{"rectified": "auto"} | settings)
 
 
 def _images_of(data: Mapping[str, Any], run: Callable[..., FilterOutput]) -> dict[str, Tensor]:
@@ -179,7 +177,7 @@ class GlueFactoryFilter(nn.Module):
     Args:
         filter: Takes Matches, returns a FilterOutput; None is :func:`two_view_filter`. A
             :class:`~tensor_stereo.DelaunayFilter` whose score looks at images gets those of ``data["view0"]["image"]``
-            and ``data["view1"]["image"]``, if they are there; it expects rectified pairs.
+            and ``data["view1"]["image"]``, if they are there.
 
     Example:
         >>> x, y = torch.meshgrid(torch.arange(0.0, 40, 10), torch.arange(0.0, 40, 10), indexing="xy")
@@ -204,8 +202,8 @@ class GlueFactoryFilter(nn.Module):
         settings = {name: value for name, value in conf.items() if name not in _PIPELINE_KEYS}
         if not settings.get("trainable"):  # glue-factory writes it into every component
             settings.pop("trainable", None)
-        if "consensus" in settings:  # of any two views, unless a tolerance of rows is named
-            settings["consensus"] = replace(UNRECTIFIED, **(settings["consensus"] or {}))
+        if "consensus" in settings:
+            settings["consensus"] = ConsensusConfig(**(settings["consensus"] or {}))
         return cls(two_view_filter(**settings))
 
     def forward(self, data: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -25,6 +25,7 @@ def agreeing_neighbors(
     row_px: float,
     disparity_px: float,
     slope: float,
+    spread: float,
     backend: str,
 ) -> Tensor:
     """How many neighbours of every match agree with it, whatever shift all matches share.
@@ -39,6 +40,7 @@ def agreeing_neighbors(
         row_px: Largest difference of the row offsets y1 - y0 of two matches that agree.
         disparity_px: Largest difference of their disparities,
         slope: and what is added to it per px between their columns in view 0.
+        spread: What is added to both per px between their columns and per px between their rows.
         backend: a name of :mod:`tensor_stereo.ops.backends`; both give the same.
 
     Returns:
@@ -46,14 +48,14 @@ def agreeing_neighbors(
 
     Example:
         >>> points, graph = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), (torch.tensor([0, 1, 2]), torch.tensor([1, 0]))
-        >>> agreeing_neighbors(points, points, *graph, *graph, 1.0, 2.0, 0.2, "auto")
+        >>> agreeing_neighbors(points, points, *graph, *graph, 1.0, 2.0, 0.2, 0.0, "auto")
         tensor([2, 2])
     """
     graphs = crow0, cols0, crow1, cols1
     kernels = native(backend)
     if kernels is None:
-        return reference.agreeing_neighbors(keypoints0, keypoints1, *graphs, row_px, disparity_px, slope)
+        return reference.agreeing_neighbors(keypoints0, keypoints1, *graphs, row_px, disparity_px, slope, spread)
     points = (view.detach().to("cpu", torch.float64).contiguous().numpy() for view in (keypoints0, keypoints1))
     patterns = (tensor.contiguous().numpy(force=True) for tensor in graphs)
-    count = kernels.agreeing_neighbors(*points, *patterns, row_px, disparity_px, slope, torch.get_num_threads())
+    count = kernels.agreeing_neighbors(*points, *patterns, row_px, disparity_px, slope, spread, torch.get_num_threads())
     return torch.from_numpy(count).to(crow0.device)

@@ -11,8 +11,8 @@ from tensor_stereo.ops import reference_consensus
 from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 
-_DIFFERENTIABLE = (0, 1, 3)  # positions of keypoints0, keypoints1 and cost
-_NUM_TENSORS, _NUM_ARGUMENTS = 9, 19
+_DIFFERENTIABLE = (0, 1, 3, 4)  # positions of keypoints0, keypoints1, cost and row_offset
+_NUM_TENSORS, _NUM_ARGUMENTS = 10, 20
 
 
 def _fake(keypoints0: Tensor, *_: object) -> Tensor:
@@ -50,14 +50,15 @@ def consensus_belief(
     keypoints1: Tensor,
     ptr: Tensor,
     cost: Tensor | None,
-    row_shift: Tensor | None,
+    row_offset: Tensor | None,
+    found1: Tensor | None,
     crow0: Tensor,
     cols0: Tensor,
     crow1: Tensor,
     cols1: Tensor,
     tolerance_px: float,
     whole_tolerance_px: float,
-    row_tolerance_px: float | None,
+    row_tolerance_px: float,
     whole_row_tolerance_px: float,
     slope: float,
     reach: float,
@@ -76,15 +77,16 @@ def consensus_belief(
         ptr: (B + 1,) int64 offsets of the pairs.
         cost: (M,) floating point, or None. In a pair with negative costs, costs count from the lowest one. In a pair
             with a cost beyond 1e300, costs are no evidence.
-        row_shift: (M,) float64 px, how much lower the row of each match in view 1 is expected than in view 0; None: not
-            at all. A constant.
+        row_offset: (M,) float64 px, how far each match lies off its row; None: that is no evidence.
+        found1: (M, 2) px of view 1 as the keypoints were found, which may lie on whole pixels; None: ``keypoints1``. A
+            constant.
         crow0: (M + 1,) int64 row offsets of the graph of view 0.
         cols0: (nnz0,) int64 neighbours, of the same pair and distinct from the match in view 0.
         crow1: (M + 1,) int64 row offsets of the graph of view 1.
         cols1: (nnz1,) int64 neighbours in view 1.
         tolerance_px: setting of :class:`tensor_stereo.configs.ConsensusConfig`, like all that follow.
         whole_tolerance_px: tolerance for keypoints on whole pixels.
-        row_tolerance_px: tolerance of row offsets, or None: row offsets are no evidence.
+        row_tolerance_px: tolerance of row offsets.
         whole_row_tolerance_px: tolerance of row offsets for keypoints on whole pixels.
         slope: expected slope of the displacement in px/px.
         reach: distance in edge lengths at which the vote of a neighbour counts half.
@@ -94,13 +96,13 @@ def consensus_belief(
         backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
-        (M,) float64 in [0, 1). Gradients flow to both point sets and the cost. The backward pass runs plain torch again
+        (M,) float64 in [0, 1). Gradients flow to both point sets, the cost and the row offset. The backward pass runs plain torch again
         under either back end, so that gradients can be differentiated again.
 
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])
-        >>> graphs, settings = (crow, torch.tensor([1, 0])) * 2, (0.6, 1.0, None, 1.0, 0.2, 2.0, 1.0, 0.5, 1)
-        >>> consensus_belief(points, points, ptr, None, None, *graphs, *settings, "auto")
+        >>> graphs, settings = (crow, torch.tensor([1, 0])) * 2, (0.6, 1.0, 0.25, 1.5, 0.2, 2.0, 1.0, 0.5, 1)
+        >>> consensus_belief(points, points, ptr, None, None, None, *graphs, *settings, "auto")
         tensor([0.4444, 0.4444], dtype=torch.float64)
     """
     tolerances = tolerance_px, whole_tolerance_px, row_tolerance_px, whole_row_tolerance_px
@@ -108,11 +110,13 @@ def consensus_belief(
     graphs = crow0, cols0, crow1, cols1
     kernels = native(backend)
     if kernels is None:
-        return reference_consensus.consensus_belief(keypoints0, keypoints1, ptr, cost, row_shift, *graphs, *settings)
+        return reference_consensus.consensus_belief(
+            keypoints0, keypoints1, ptr, cost, row_offset, found1, *graphs, *settings
+        )
     result = kernels.consensus_belief(
         *(_to_float64(keypoints) for keypoints in (keypoints0, keypoints1)),
         ptr.contiguous().numpy(force=True),
-        *(None if values is None else _to_float64(values) for values in (cost, row_shift)),
+        *(None if values is None else _to_float64(values) for values in (cost, row_offset, found1)),
         *(tensor.contiguous().numpy(force=True) for tensor in graphs),
         *settings,
         torch.get_num_threads(),

@@ -52,15 +52,17 @@ def agreeing_neighbors(
     row_px: float,
     disparity_px: float,
     slope: float,
+    spread: float,
 ) -> Tensor:
     """How many neighbours move as a match does; see :func:`tensor_stereo.ops.agreeing_neighbors`."""
-    x, offset = keypoints0[:, 0].double(), keypoints1.double() - keypoints0.double()
-    seen = torch.stack([x, x - keypoints1[:, 0].double(), offset[:, 1]], 1)
+    places, partners = keypoints0.double(), keypoints1.double()
+    seen = torch.cat([places, places[:, :1] - partners[:, :1], partners[:, 1:] - places[:, 1:]], 1)
     count = torch.zeros_like(crow0[1:])
     for crow, j in ((crow0, cols0), (crow1, cols1)):
         i = torch.repeat_interleave(crow.diff())
-        way, disparity, row = (seen.index_select(0, i) - seen.index_select(0, j)).abs_().unbind(1)
-        agrees = (row <= row_px) & (disparity <= disparity_px + slope * way)
+        x, y, disparity, row = (seen.index_select(0, i) - seen.index_select(0, j)).abs_().unbind(1)
+        more = spread * (x + y)
+        agrees = (row <= row_px + more) & (disparity <= disparity_px + slope * x + more)
         count.index_add_(0, i, agrees.to(count.dtype))
     return count
 

@@ -43,14 +43,15 @@ def consensus_belief(
     keypoints1: Tensor,
     ptr: Tensor,
     cost: Tensor | None,
-    row_shift: Tensor | None,
+    row_offset: Tensor | None,
+    found1: Tensor | None,
     crow0: Tensor,
     cols0: Tensor,
     crow1: Tensor,
     cols1: Tensor,
     tolerance_px: float,
     whole_tolerance_px: float,
-    row_tolerance_px: float | None,
+    row_tolerance_px: float,
     whole_row_tolerance_px: float,
     slope: float,
     reach: float,
@@ -63,7 +64,7 @@ def consensus_belief(
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])
         >>> graphs = (crow, torch.tensor([1, 0])) * 2
-        >>> consensus_belief(points, points, ptr, None, None, *graphs, 0.6, 1.0, None, 1.0, 0.2, 2.0, 1.0, 0.5, 1)
+        >>> consensus_belief(points, points, ptr, None, None, None, *graphs, 0.6, 1.0, 0.25, 1.5, 0.2, 2.0, 1.0, 0.5, 1)
         tensor([0.4444, 0.4444], dtype=torch.float64)
     """
     views = keypoints0.double(), keypoints1.double()
@@ -71,13 +72,12 @@ def consensus_belief(
         torch.arange(ptr.shape[0] - 1, device=ptr.device), ptr.diff(), output_size=keypoints0.shape[0]
     )
     count = ptr.diff().clamp(min=1)
-    whole = _whole_pixels(views, row_shift, pair, count)
+    found = (views[0], views[1] if found1 is None else found1.double())
+    whole = _whole_pixels(found, row_offset, pair, count)
     evidence = torch.zeros_like(whole)
-    if row_tolerance_px is not None:
+    if row_offset is not None:
         tolerance = row_tolerance_px + (whole_row_tolerance_px - row_tolerance_px) * whole
-        offset = views[0][:, 1] - views[1][:, 1]
-        offset = offset if row_shift is None else offset + row_shift
-        evidence = evidence - torch.log1p((offset / tolerance).square())
+        evidence = evidence - torch.log1p((row_offset / tolerance).square())
     if cost is not None:
         evidence = evidence - cost_weight * _standardized_cost(cost.double(), pair, count)
     prior_odds = evidence.clamp(-_MAX_EVIDENCE, _MAX_EVIDENCE).exp()
@@ -91,12 +91,12 @@ def consensus_belief(
 
 
 @torch.no_grad()
-def _whole_pixels(views: tuple[Tensor, Tensor], row_shift: Tensor | None, pair: Tensor, count: Tensor) -> Tensor:
+def _whole_pixels(views: tuple[Tensor, Tensor], row_offset: Tensor | None, pair: Tensor, count: Tensor) -> Tensor:
     """(M,) how far the keypoints of the pair of each match lie on a grid of one pixel: 1 exactly, 0 anywhere.
 
     The length of the mean of exp(2 pi i x), for both coordinates in both views; no shift changes it. Rows of view 1
-    count as they are or without ``row_shift``, whichever is nearer to a grid: a rig drifts before keypoints are found
-    on whole pixels, somebody may have moved them afterwards.
+    count as they are or without what all matches share, whichever is nearer to a grid: a rig drifts before keypoints
+    are found on whole pixels, somebody may have moved them afterwards.
     """
 
     def length(values: Tensor) -> Tensor:
@@ -104,7 +104,7 @@ def _whole_pixels(views: tuple[Tensor, Tensor], row_shift: Tensor | None, pair: 
         return torch.hypot(*(_mean(part, pair, count) for part in (phase.cos(), phase.sin())))
 
     x0, y0, x1, y1 = (values for keypoints in views for values in keypoints.T.contiguous())
-    last = length(y1) if row_shift is None else torch.maximum(length(y1), length(y1 - row_shift))
+    last = length(y1) if row_offset is None else torch.maximum(length(y1), length(y0 - row_offset))
     return (length(x0) * length(y0) * length(x1) * last).index_select(0, pair)
 
 

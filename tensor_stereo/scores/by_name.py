@@ -27,7 +27,7 @@ class ScoredMatches(NamedTuple):
         graphs: The Delaunay graphs of both views.
         cumulative: (M, 5) probabilities of an error of at most each of
             :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`; None for ``topology``, which is no probability.
-        alignment: Where the rows of view 0 lie in view 1, which the score has taken out; None where it takes none out.
+        alignment: What the matches of every pair share, which the score has taken out; None for ``topology``.
         domain: (B,) int8, values of :class:`tensor_stereo.scores.domain.Domain`: why a pair lies outside of what the
             score was calibrated on; None for ``topology``.
     """
@@ -65,10 +65,10 @@ def score_matches(
             :func:`tensor_stereo.scores.image_evidence.measure_images` takes them.
         evidence: What the images say, if that was measured before; instead of ``images``. Nobody checks then whether
             the keypoints lie in them.
-        alignment: Where the rows of view 0 lie in view 1, which ``consensus`` and ``learned`` take out; None: it is
-            estimated for rectified pairs.
+        alignment: What the matches of every pair share, which ``consensus`` and ``learned`` take out; None: it is
+            estimated, of pairs that are what ``config.rectified`` says.
         temperature: () of ``topology``, in place of that of the settings, for gradients.
-        network: The network of ``learned``; None means the one with the weights of this package.
+        network: The network of ``learned``, for all pairs; None means those with the weights of this package.
 
     Returns:
         The scores. That of ``consensus`` and of ``learned`` is the calibrated probability of an error of at most
@@ -108,8 +108,8 @@ def score_matches(
         return ScoredMatches(soft_jaccard(counts), found.graphs)
     if graphs is None:
         graphs = build_match_graphs(matches, **options)  # type: ignore[arg-type]
-    if alignment is None and is_aligned(config):
-        alignment = estimate_alignment(matches, graphs, backend=config.backend)
+    if alignment is None:
+        alignment = estimate_alignment(matches, graphs, rectified=config.rectified, backend=config.backend)
     domain = check_domain(matches, graphs, config, alignment)
     if name == "consensus":
         cumulative = consensus_probabilities(matches, graphs, config, alignment)
@@ -119,13 +119,3 @@ def score_matches(
             evidence = measure_images(*images, matches, graphs, alignment)
         cumulative = learned_probabilities(matches, graphs, evidence, config, alignment=alignment, network=network)
     return ScoredMatches(probability_within(cumulative, config.max_error_px), graphs, cumulative, alignment, domain)
-
-
-def is_aligned(config: FilterConfig) -> bool:
-    """Whether the score takes the alignment of rectified pairs out.
-
-    >>> is_aligned(FilterConfig()), is_aligned(FilterConfig(verdict="cardinality"))
-    (True, False)
-    """
-    name = config.resolved_score
-    return name == "learned" or (name == "consensus" and config.consensus.rectified)

@@ -9,23 +9,26 @@ from torch import Tensor
 
 from tensor_stereo.scores.tolerance import rising
 
-# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999) at each of TOLERANCES_PX, rectified
-# or not; fitted by benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
-_CONSENSUS = {
-    True: ((0.67, 0.45), (0.66, 2.40), (0.59, 3.14), (0.61, 3.63), (0.62, 4.03)),
-    False: ((0.74, 0.25), (0.75, 2.04), (0.62, 2.75), (0.62, 3.14), (0.60, 3.45)),
-}
+# Slope and bias of a logistic regression on the log-odds of the belief (Platt 1999) at each of TOLERANCES_PX, for pairs
+# that are rectified, that have epipolar lines, and that have neither; fitted by
+# benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
+_CONSENSUS = (
+    ((0.67, 0.45), (0.66, 2.40), (0.59, 3.14), (0.61, 3.63), (0.62, 4.03)),
+    ((0.67, 0.45), (0.66, 2.40), (0.59, 3.14), (0.61, 3.63), (0.62, 4.03)),
+    ((0.74, 0.25), (0.75, 2.04), (0.62, 2.75), (0.62, 3.14), (0.60, 3.45)),
+)
 _LEAST = 1e-4  # probability, of either outcome
 _NUM_KNOTS = 2048  # linear between them, the probability is off by less than 3e-6
 _PARTS = 2**32  # of one match; whole numbers add up to the same in any order
 
 
-def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
+def calibrate_consensus(belief: Tensor, kind: Tensor | None = None) -> Tensor:
     """The probabilities that a match is correct within each tolerance, from the belief of its neighbours.
 
     Args:
         belief: (M,) as :func:`tensor_stereo.scores.consensus.consensus_belief` gives it.
-        rectified: whether the row offset was evidence.
+        kind: (M,) int64, what the pair of each match is: 0 rectified, 1 not, with epipolar lines, 2 without; None means
+            that all are rectified.
 
     Returns:
         (M, 5) float64, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`, growing with the belief and never
@@ -36,14 +39,15 @@ def calibrate_consensus(belief: Tensor, *, rectified: bool = True) -> Tensor:
     """
     # Linear between knots: exponentials would differ in the last bit between a vector's lanes and its rest, and a batch
     # would not equal the loop over its pairs.
-    slope, bias = torch.tensor(_CONSENSUS[rectified], dtype=torch.float64, device=belief.device).unbind(1)
+    slope, bias = torch.tensor(_CONSENSUS, dtype=torch.float64, device=belief.device).transpose(0, 1)[..., None].unbind(2)
     end = math.log((1 - _LEAST) / _LEAST)
     logits = torch.linspace(-end, end, _NUM_KNOTS + 1, dtype=torch.float64, device=belief.device)
-    knots, values = torch.sigmoid(logits), torch.sigmoid(slope[:, None] * logits + bias[:, None])  # (K,), (5, K)
+    knots, values = torch.sigmoid(logits), torch.sigmoid(slope * logits + bias)  # (K,), (5, 3, K)
     place = belief.double().clamp(knots[0], knots[-1])
     k = torch.searchsorted(knots, place.detach(), right=True).clamp(1, len(knots) - 1) - 1
     share = (place - knots.index_select(0, k)) / (knots[1:] - knots[:-1]).index_select(0, k)
-    columns = [row.index_select(0, k) + share * row.diff().index_select(0, k) for row in values]
+    at = k if kind is None else k + len(knots) * kind
+    columns = [row.index_select(0, at) + share * row.diff().index_select(0, at) for row in values.flatten(1)]
     return rising(columns)
 
 

@@ -9,13 +9,15 @@ more than their share: of several surfaces one is enough.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from tensor_stereo import ops
+from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.ops.registration import refuse_tangent
-from tensor_stereo.scores.alignment import Alignment
+from tensor_stereo.scores.alignment.form import Alignment, alignment_kind, epipolar_frames
 from tensor_stereo.scores.calibration import calibrate_consensus
 from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Matches
@@ -29,9 +31,8 @@ def consensus_score(
     Args:
         matches: B pairs, as for :func:`consensus_belief`.
         graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
-        config: The settings ``consensus``, ``max_error_px`` and ``backend`` are read; None means the defaults, for
-            rectified pairs.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+        config: The settings ``consensus``, ``max_error_px`` and ``backend`` are read; None means the defaults.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
 
     Returns:
         (M,) probability of an error of at most ``max_error_px``, of :func:`consensus_probabilities`, in the dtype of
@@ -66,8 +67,8 @@ def consensus_probabilities(
     Args:
         matches: B pairs, as for :func:`consensus_belief`.
         graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
-        config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+        config: The settings ``consensus`` and ``backend`` are read; None means the defaults.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
 
     Returns:
         (M, 5) in the dtype of the keypoints, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`; no row falls.
@@ -85,7 +86,8 @@ def consensus_probabilities(
     """
     config = config or FilterConfig()
     belief = _believe(matches, graphs, config, alignment)
-    return calibrate_consensus(belief, rectified=config.consensus.rectified).to(matches.keypoints0.dtype)
+    kind = None if alignment is None else alignment_kind(matches, alignment)
+    return calibrate_consensus(belief, kind).to(matches.keypoints0.dtype)
 
 
 def consensus_belief(
@@ -97,9 +99,9 @@ def consensus_belief(
         matches: B pairs, coordinates in px: what is below 1 px is near. ``cost``, if given, is evidence: it is compared
             with the other costs of its pair, and left out in pairs that have infinite ones.
         graphs: The graphs of both views, as :func:`tensor_stereo.graphs.build_match_graphs` gives them.
-        config: The settings ``consensus`` and ``backend`` are read; None means the defaults, for rectified pairs. Back
-            ends may differ in the last digits.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+        config: The settings ``consensus`` and ``backend`` are read; None means the defaults. Back ends may differ in
+            the last digits.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
 
     Returns:
         (M,) in [0, 1], higher is more likely correct; 0 without neighbours; in the dtype of the keypoints. Gradients
@@ -132,15 +134,9 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignm
             refuse_tangent(name, values, "consensus")
     check_match_graphs(matches, graphs)
     settings = config.consensus
-    row_shift = None
-    if settings.rectified and alignment is not None:
-        row_shift = alignment.row_shift(matches)
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
-        matches.keypoints1,
-        matches.ptr,
-        matches.cost,
-        row_shift,
+        *_displacements(matches, alignment),
         graphs.adjacency0.crow_indices,
         graphs.adjacency0.col_indices,
         graphs.adjacency1.crow_indices,
@@ -157,3 +153,27 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignm
         config.backend,
     )
     return belief
+
+
+def _displacements(
+    matches: Matches, alignment: Alignment | None
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor | None]:
+    """Keypoints of view 1, offsets of the pairs, cost, offset of the rows, and keypoints of view 1 as found."""
+    right = matches.keypoints1
+    row_offset = matches.keypoints0[:, 1].double() - right[:, 1].double()
+    if alignment is None:
+        return right, matches.ptr, matches.cost, row_offset, None
+    row_offset = row_offset + alignment.row_shift(matches)
+    if not torch.compiler.is_compiling() and bool(alignment.rectified.all()):
+        return right, matches.ptr, matches.cost, row_offset, None
+    batch = ptr_to_batch(matches.ptr)
+    frames = epipolar_frames(matches, alignment)
+    is_rectified, has_rows = (
+        values.index_select(0, batch) for values in (alignment.rectified, alignment.has_rows)
+    )
+    off = torch.where(has_rows, -frames.moved[:, 1], 0)
+    row_offset = torch.where(is_rectified, row_offset, off)
+    is_rectified = is_rectified[:, None]
+    # Keypoints that were found on whole pixels may have been moved since in view 1; of any two views, view 0 tells.
+    found = torch.where(is_rectified, right, matches.keypoints0)
+    return torch.where(is_rectified, right.double(), frames.partners), matches.ptr, matches.cost, row_offset, found

@@ -1,4 +1,4 @@
-"""Marks what lies outside of the domain of a calibrated score: rectified pairs, in pixels, whose matches agree."""
+"""Marks what lies outside of the domain of a calibrated score: pairs in pixels, whose matches agree."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Domain(IntFlag):
     """
 
     SPAN = 1  # the keypoints span less than 4 px, as normalised coordinates do
-    AGREEMENT = 2  # fewer than 12 matches agree with their neighbours, so that no alignment of the rows is known
-    ROWS = 4  # those that agree lie off their rows, in a way that no slow drift explains
+    AGREEMENT = 2  # fewer than 12 matches agree with their neighbours, so that no alignment is known
+    ROWS = 4  # those that agree lie off their rows, or epipolar lines, in a way that nothing that all share explains
     IMAGES = 8  # more than a tenth of the keypoints of a view lie outside of its image
 
 
@@ -58,7 +58,7 @@ def describe_domain(mark: int) -> str:
 def check_domain(
     matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignment: Alignment | None = None
 ) -> Tensor:
-    """Mark pairs whose keypoints are no pixels of rectified pairs; one warning of a kind for the whole batch.
+    """Mark pairs whose keypoints are no pixels, or do not fit together; one warning of a kind for the whole batch.
 
     Pairs without matches have no mark. A pair of few matches is marked where fewer than 12 of them agree, as any pair
     is, but a warning says so only from 32 tested ones on. Where ``torch.compile`` traces, there are marks without
@@ -67,10 +67,8 @@ def check_domain(
     Args:
         matches: B pairs.
         graphs: The graphs of the same matches.
-        alignment: What the score takes out of the rows of rectified pairs; None: nothing, and their agreement and their
-            rows are not looked at.
-        config: Its score is ``consensus`` or ``learned``; ``consensus`` can be set for pairs that are not rectified,
-            which only their span can mark.
+        alignment: What the score takes out; None: nothing, and agreement and rows are not looked at.
+        config: Its score is ``consensus`` or ``learned``.
 
     Returns:
         (B,) int8, values of :class:`Domain`: ``SPAN``, ``AGREEMENT`` and ``ROWS``. No gradient.
@@ -86,7 +84,8 @@ def check_domain(
         small = _spans(matches, batch) < _LEAST_SPAN_PX
         off = few = told = torch.zeros_like(small)
         if alignment is not None:
-            off = alignment.unfit | _off_their_rows(align_matches(matches, alignment), graphs, batch, config)
+            off = _off_their_rows(align_matches(matches, alignment), graphs, batch, config) & alignment.has_rows
+            off |= alignment.unfit
             few = ~alignment.fitted & ~off & (matches.ptr.diff() > 0)
             told = few & (_count(graphs.group_size >= config.min_group_size, batch, matches) >= _LEAST_TOLD)
     if not torch.compiler.is_compiling():
@@ -97,11 +96,16 @@ def check_domain(
             "the score expects keypoints in pixels, but those of {pairs} span less than "
             f"{_LEAST_SPAN_PX:g} px; multiply normalised coordinates by the size of the image",
         )
+        of_views = off if alignment is None else off & ~alignment.rectified
         _warn(
-            off,
+            off & ~of_views,
             "the score expects rectified pairs, but the matches of {pairs} that agree with their neighbours lie off "
-            "their rows; rectify, or set the score 'consensus' with consensus=UNRECTIFIED, or the verdict "
-            "'cardinality'",
+            "their rows; set rectified=False, or 'auto', which looks at every pair",
+        )
+        _warn(
+            of_views,
+            "the score expects that one map of view 0 to view 1, or one motion, explains most of the matches that agree "
+            "with their neighbours, but those of {pairs} have none in common",
         )
         _warn(
             told,

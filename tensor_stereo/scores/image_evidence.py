@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from tensor_stereo.features import list_images, to_gray
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
-from tensor_stereo.scores.alignment import Alignment, align_matches
+from tensor_stereo.scores.alignment.form import Alignment, align_matches
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.scores.windows import (
     LIKE,

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.scores.alignment import Alignment
+from tensor_stereo.scores.alignment.form import Alignment
 from tensor_stereo.scores.image_evidence import NUM_VALUES, ImageEvidence
 from tensor_stereo.scores.learned_inputs import (
     NUM_COST,

@@ -15,7 +15,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.relations import shared_neighbors
-from tensor_stereo.scores.alignment import Alignment, align_matches
+from tensor_stereo.scores.alignment.form import Alignment, align_matches
 from tensor_stereo.scores.image_evidence import NUM_CURVES, NUM_VALUES, ImageEvidence
 from tensor_stereo.types import Adjacency, Matches
 
@@ -80,14 +80,15 @@ def measure_quantities(
     """Collect what the network sees.
 
     Nothing depends on the order of the matches, on the other pairs, on a common shift of both views, or on a shift of
-    one of them along the rows; and next to nothing on what the alignment takes out.
+    one of them along the rows; and next to nothing on what the alignment takes out. In pairs that are not rectified the
+    epipolar lines stand for the rows, and the way along them for the disparity.
 
     Args:
         matches: B pairs; without ``cost`` its columns are zero.
         graphs: graphs of the same matches.
         evidence: evidence of the images; None: its columns are zero.
         config: ``backend`` is read; None means the defaults.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
 
     Returns:
         The quantities. Gradients flow from all that is continuous in the keypoints, and are finite; none through
@@ -106,11 +107,14 @@ def measure_quantities(
     check_fit(matches, graphs, evidence)
     batch = ptr_to_batch(matches.ptr)
     share = (1 / matches.ptr.diff().double()).index_select(0, batch)[:, None]
-    matches = matches if alignment is None else align_matches(matches, alignment)
+    has_rows = None
+    if alignment is not None:
+        has_rows = alignment.has_rows.index_select(0, batch)[:, None].float()
+        matches = align_matches(matches, alignment)
     points = [_center(view, matches.num_pairs, batch, share) for view in (matches.keypoints0, matches.keypoints1)]
     disparity = matches.keypoints0[:, :1].double() - matches.keypoints1[:, :1].double()
     row_offset = (matches.keypoints0[:, 1].double() - matches.keypoints1[:, 1].double()).abs().float()
-    nodes, degree = _node_quantities(row_offset, graphs, config or FilterConfig())
+    nodes, degree = _node_quantities(row_offset, has_rows, graphs, config or FilterConfig())
     if matches.cost is None:
         cost, has_cost = nodes.new_zeros(len(nodes), NUM_COST), nodes.new_zeros(len(nodes), 1)
     else:
@@ -171,18 +175,22 @@ def _center(values: Tensor, num_pairs: int, batch: Tensor, share: Tensor) -> Ten
     return (values - mean.index_select(0, batch)).float()
 
 
-def _node_quantities(row_offset: Tensor, graphs: MatchGraphs, config: FilterConfig) -> tuple[Tensor, Tensor]:
+def _node_quantities(
+    row_offset: Tensor, has_rows: Tensor | None, graphs: MatchGraphs, config: FilterConfig
+) -> tuple[Tensor, Tensor]:
+    """(M, NUM_NODE) and (M,) number of neighbours. Three zeros, which no offset gives, where no row is known."""
     counts = shared_neighbors(graphs.adjacency0, graphs.adjacency1, backend=config.backend)
     overlap, degree0, degree1 = (count.float() for count in counts)
     degree = (degree0 + degree1 - overlap).clamp(min=1)
+    rows = [torch.exp(-2 * row_offset), torch.exp(-row_offset / 2), torch.log1p(row_offset)]
+    if has_rows is not None:
+        rows = [column * has_rows[:, 0] for column in rows]
     columns = [
         overlap / degree,
         overlap / torch.minimum(degree0, degree1).clamp(min=1),
         torch.log1p(degree0),
         torch.log1p(degree1),
-        torch.exp(-2 * row_offset),
-        torch.exp(-row_offset / 2),
-        torch.log1p(row_offset),
+        *rows,
         torch.log1p(overlap),
     ]
     return torch.stack(columns, 1), degree

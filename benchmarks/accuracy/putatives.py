@@ -1,7 +1,7 @@
 """Putative matches with ground truth, the same for every score and every peer.
 
 OpenCV and NumPy detect and match, not this library, so that no change of its detectors or its matching moves a figure.
-Only SURF comes through this library, from mahotas.
+Only SURF comes through this library, from mahotas. Learned matches come from kornia.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 import tensor_stereo as ts
+from shared.learned_matchers import match_learned
 from shared.scenes import GATES
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.datasets import SyntheticDataset, find_pairs, read_pair
@@ -45,7 +46,7 @@ class Putatives:
         scene: name of the pair.
         points0: (M, 2) px of view 0, distinct.
         points1: (M, 2) px of view 1, distinct.
-        cost: (M,) SSD; NaN for matches that were made up.
+        cost: (M,) SSD, or 1 - confidence of learned matches; NaN for matches that were made up.
         ratio: (M,) distance over that of the second-best candidate; NaN without one.
         valid: (M,) ground truth is known.
         correct: (M,) disparity and row are off by at most :data:`MAX_ERROR_PX`.
@@ -123,18 +124,15 @@ def find_putatives(pair: GrayPair, detector: str, *, gated: bool) -> Putatives:
     chosen = order[np.unique(rows1[order], return_index=True)[1]]
     points0, points1 = points0[rows0[chosen]], points1[rows1[chosen]]
     best, second = best[chosen].clip(0), second[chosen]
-    for view in (0, 1):  # keypoints of several orientations
-        distinct = np.unique((points0, points1)[view].round(3), axis=0, return_index=True)[1]
-        points0, points1, best, second = points0[distinct], points1[distinct], best[distinct], second[distinct]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.where(np.isfinite(second) & (second > 0), np.sqrt(best / second), np.nan)
-    matches = ts.Matches(*map(torch.from_numpy, (points0, points1)), torch.tensor([0, len(points0)]))
-    error = errors_against_gt(matches, torch.from_numpy(pair.disparity_gt)[None]).numpy()
-    x, y = np.rint(points0).astype(int).T
-    truth = pair.disparity_gt[y.clip(0, pair.left.shape[0] - 1), x.clip(0, pair.left.shape[1] - 1)]
-    off = np.where(np.isfinite(truth), np.abs(points0[:, 0] - points1[:, 0] - truth), np.nan)
-    valid, correct = ~np.isnan(error), error <= MAX_ERROR_PX
-    return Putatives(pair.scene, points0, points1, best, ratio, valid, correct, error, off, (pair.left, pair.right))
+    return _judge(pair, points0, points1, best, ratio)
+
+
+def find_learned_putatives(pair: GrayPair, *, folder: Path | None = None) -> Putatives:
+    """The matches of ALIKED and LightGlue, which :func:`match_learned` may keep in ``folder``; they have no ratio."""
+    points0, points1, confidence = match_learned(pair.left, pair.right, folder=folder)
+    return _judge(pair, points0, points1, 1 - confidence, np.full(len(confidence), np.nan))
 
 
 def draw_random_partners(given: Putatives, share: float, seed: int) -> Putatives:
@@ -171,6 +169,20 @@ def to_matches(found: list[Putatives], *, with_cost: bool = False) -> ts.Matches
 def to_images(found: list[Putatives]) -> list[list[torch.Tensor]]:
     """(1, H, W) uint8 of all pairs, by view."""
     return [[torch.from_numpy(one.views[view])[None] for one in found] for view in (0, 1)]
+
+
+def _judge(pair: GrayPair, points0: Float, points1: Float, cost: Float, ratio: Float) -> Putatives:
+    """The matches of distinct keypoints, with their errors."""
+    for view in (0, 1):  # keypoints of several orientations
+        distinct = np.unique((points0, points1)[view].round(3), axis=0, return_index=True)[1]
+        points0, points1, cost, ratio = points0[distinct], points1[distinct], cost[distinct], ratio[distinct]
+    matches = ts.Matches(*map(torch.from_numpy, (points0, points1)), torch.tensor([0, len(points0)]))
+    error = errors_against_gt(matches, torch.from_numpy(pair.disparity_gt)[None]).numpy()
+    x, y = np.rint(points0).astype(int).T
+    truth = pair.disparity_gt[y.clip(0, pair.left.shape[0] - 1), x.clip(0, pair.left.shape[1] - 1)]
+    off = np.where(np.isfinite(truth), np.abs(points0[:, 0] - points1[:, 0] - truth), np.nan)
+    valid, correct = ~np.isnan(error), error <= MAX_ERROR_PX
+    return Putatives(pair.scene, points0, points1, cost, ratio, valid, correct, error, off, (pair.left, pair.right))
 
 
 def _select(given: Putatives, rows: Bool) -> Putatives:

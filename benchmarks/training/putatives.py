@@ -70,10 +70,10 @@ def find_putatives(scene: Scene, number: int) -> list[Putatives]:
         for matching in (MatchingConfig(), GATES):
             config = replace(FIXED, detector=detector, matching=matching)
             kind = f"{detector}{' g' if matching is GATES else ''}"
-            found.append(_judge(scene, kind, True, views, _match(views, config)))
+            found.append(judge_matches(scene, kind, True, views, _match(views, config)))
     for variant in range(VARIANTS[scene.domain]):
         rng = np.random.default_rng([5, number, variant])
-        altered = _alter(views, rng)
+        altered = alter_views(views, rng)
         if not np.isfinite(altered.disparity0).any():
             continue
         largest_px = float(np.nanmax(altered.disparity0))
@@ -89,17 +89,18 @@ def find_putatives(scene: Scene, number: int) -> list[Putatives]:
         if matches.num_matches < MIN_MATCHES:
             continue
         kind = f"{config.detector}-{backend}{' g' if gated else ''}{' moved' if is_moved else ''}"
-        found.append(_judge(scene, kind, False, altered, matches))
+        found.append(judge_matches(scene, kind, False, altered, matches))
     return found
 
 
-def _judge(scene: Scene, kind: str, fixed: bool, views: Views, matches: Matches) -> Putatives:
+def judge_matches(scene: Scene, kind: str, fixed: bool, views: Views, matches: Matches) -> Putatives:
+    """The matches with their errors against the truth of the views."""
     error_px = errors_against_gt(matches, [torch.from_numpy(views.disparity0.copy())])
     images = tuple(torch.from_numpy(x.copy())[None] for x in views[:2])
     return Putatives(scene.name, scene.domain, kind, fixed, scene.least_error_px, matches, images, error_px)
 
 
-def _alter(views: Views, rng: np.random.Generator) -> Views:
+def alter_views(views: Views, rng: np.random.Generator) -> Views:
     """Mirror, turn over, resize, crop, and change noise, blur and exposure, each with some probability."""
     image0, image1, disparity0, disparity1 = views
     if disparity1 is not None and rng.random() < 0.4:  # mirrored views change places

@@ -151,8 +151,8 @@ class FilterConfig:
     is at most ``max_error_px``, in px of view 0.
 
     ``auto`` stands for ``learned`` under the verdict ``score``, and for no score under the verdicts of the paper, so
-    that nobody pays for what is not asked. In :class:`tensor_stereo.DelaunayFilter` it stands for ``topology`` under the
-    verdicts of the paper.
+    that nobody pays for what is not asked. In :class:`tensor_stereo.DelaunayFilter` it stands for ``topology`` under
+    the verdicts of the paper.
 
     ``consensus`` and ``learned`` take out what all matches of a pair share: the row offset of rectified pairs, whose
     partners lie on one row; of others rotation, scale and perspective, with the epipolar lines in the place of rows.

@@ -13,13 +13,13 @@ from torch import Tensor, nn
 
 from tensor_stereo.batching import from_padded, lengths_to_ptr, select_matches
 from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
-from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FileFilterConfig, FilterConfig
+from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FilterConfig
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores.alignment import Alignment
 from tensor_stereo.scores.by_name import score_matches
 from tensor_stereo.scores.image_evidence import ImageEvidence
-from tensor_stereo.scores.learned import LearnedScore, load_learned
+from tensor_stereo.scores.learned import LearnedNetworks, load_learned
 from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
 
@@ -41,8 +41,9 @@ class FilterOutput:
         relation: int8 values of :class:`Relation`, UNTESTED in the padding.
         matches: the M real matches of the input, as one ragged batch.
         mask: bool, the places of ``matches`` in the layout; None for ragged input.
-        alignment: Row offset and row drift of each of the B rectified pairs, which the score has taken out, and whether
-            enough matches agree on them; None where the score takes none out.
+        alignment: What the matches of each of the B pairs share, which the score has taken out: row offset and drift of
+            rectified pairs, map and epipolar lines of others, and whether enough matches agree on them; None where the
+            score takes none out.
         cumulative: One axis more: probabilities of an error of at most each of
             :data:`tensor_stereo.scores.TOLERANCES_PX`, 0 where the score is; None where that is no probability.
         domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
@@ -116,7 +117,10 @@ class DelaunayFilter(nn.Module):
             this fraction of the incorrect ones.
             ``max_error_px``: The score is the probability of an error of at most this, from .5 to 5 px of view 0.
             ``min_group_size``, ``tie_tolerance``, ``backend``: As in :func:`tensor_stereo.classify_matches`.
-            ``consensus``: Settings of that score; ``UNRECTIFIED`` is for pairs that are not rectified.
+            ``rectified``: Whether partners lie on one row, as ``learned`` and ``consensus`` expect by default; False
+            for any two views; ``auto`` decides for every pair by its matches, and ``alignment.rectified`` says what it
+            took.
+            ``consensus``: Settings of that score.
             ``temperature``: Of ``topology``; dual Voronoi edges much shorter than this are hardly told from ties.
             ``temperature_unit``: ``edge``, in lengths of the edge at hand, so that the score does not depend on scale;
             or ``px``.
@@ -167,7 +171,7 @@ class DelaunayFilter(nn.Module):
             if given and score not in needed:
                 raise ValueError(f"{name} must be False where the score is {score!r}")
         self.straight_through = straight_through
-        self.network: LearnedScore | None = None
+        self.network: LearnedNetworks | None = None
         with torch.inference_mode(False):  # tensors that were made in it could never take part in a gradient
             logarithm = torch.tensor(config.temperature, dtype=torch.float64).log()
             if learnable_temperature:
@@ -175,7 +179,11 @@ class DelaunayFilter(nn.Module):
             else:
                 self.register_buffer("log_temperature", logarithm)
             if score == "learned":
-                self.network = copy.deepcopy(load_learned()).requires_grad_(trainable)
+                networks = (
+                    copy.deepcopy(load_learned(rectified=kind)) if config.rectified in (kind, "auto") else None
+                    for kind in (True, False)
+                )
+                self.network = LearnedNetworks(*networks).requires_grad_(trainable)
         self.register_load_state_dict_pre_hook(_refuse_other_score)  # type: ignore[no-untyped-call]
 
     @property
@@ -223,6 +231,8 @@ class DelaunayFilter(nn.Module):
             settings["temperature_unit"] = config.temperature_unit
         if score == "consensus":
             settings["consensus"] = asdict(config.consensus)
+        if score in ("consensus", "learned"):
+            settings["rectified"] = config.rectified
         return settings
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DelaunayFilter:
@@ -269,8 +279,8 @@ class DelaunayFilter(nn.Module):
                 beside a score that looks at none.
 
         Warns:
-            DomainWarning: if the keypoints are no pixels of rectified pairs whose matches agree, as ``learned`` and
-                ``consensus`` expect.
+            DomainWarning: if the keypoints are no pixels, or matches do not agree on rows of rectified pairs, or on a
+                map of other views, as ``learned`` and ``consensus`` expect.
         """
         if isinstance(keypoints0, Matches):
             rest = {"keypoints1": keypoints1, "mask": mask, "group": group, "cost": cost}
@@ -339,7 +349,7 @@ def _refuse_other_score(module: DelaunayFilter, state_dict: dict[str, Any], pref
 
 def _merge(config: FilterConfig, settings: dict[str, Any]) -> FilterConfig:
     """The same settings with others in their place; raises for names that are none."""
-    if not isinstance(config, FilterConfig) or isinstance(config, FileFilterConfig):
+    if not isinstance(config, FilterConfig):
         raise TypeError(f"config must be a FilterConfig, got {config!r}; other settings are keyword arguments")
     names = [f.name for f in fields(FilterConfig)]
     for name in settings:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
 from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
-from tensor_stereo.configs import PipelineConfig
+from tensor_stereo.configs import PipelineConfig, Rectified
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
@@ -54,7 +54,8 @@ class PipelineOutput:
         seconds: wall time of each stage for the whole batch.
         cumulative: (M, 5) probabilities of an error of at most each of :data:`tensor_stereo.scores.TOLERANCES_PX`, 0
             for untested matches; None where the score is no probability.
-        alignment: Row offset and row drift of each pair, which the score has taken out; None where it takes none out.
+        alignment: What the matches of each pair share, such as a row offset, which the score has taken out; None where
+            it takes none out.
         domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
             probability was calibrated on, 0 inside; None where there is no probability.
     """
@@ -81,7 +82,7 @@ class PipelineOutput:
 
 
 def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineConfig()) -> PipelineOutput:
-    """Detect, match, classify and score a list of rectified pairs.
+    """Detect, match, classify and score a list of pairs, rectified unless the settings say otherwise.
 
     Args:
         pairs: B pairs (image0, image1), each (C, H, W) uint8 or floating point in [0, 1], C = 1 or 3 (RGB). Sizes may
@@ -92,7 +93,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         The matches of all pairs with their verdicts and scores. No gradient.
 
     Raises:
-        ValueError: if there is no pair, the views of one differ in size, or an image has another layout.
+        ValueError: if there is no pair, the views of a rectified one differ in size, or an image has another layout.
 
     Example:
         >>> from tensor_stereo.datasets.synthetic.rendering import render_pair
@@ -103,7 +104,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         (True, True)
     """
     watch = Stopwatch()
-    gray = to_gray_pairs(pairs)
+    gray = to_gray_pairs(pairs, rectified=config.rectified)
     matches = match_pairs(gray, config, watch)
     if config.constrained:
         matches = group_pairs(gray, matches, config, watch)
@@ -120,16 +121,16 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
     return PipelineOutput(matches, graphs, verdicts, score, watch.seconds, cumulative, found.alignment, found.domain)
 
 
-def to_gray_pairs(pairs: Sequence[ImagePair]) -> list[ImagePair]:
+def to_gray_pairs(pairs: Sequence[ImagePair], *, rectified: Rectified = True) -> list[ImagePair]:
     """Convert colour once: every image becomes (1, 1, H, W) uint8.
 
     Raises:
-        ValueError: if there is no pair, or the views of one differ in size.
+        ValueError: if there is no pair, or the views of a rectified one differ in size.
     """
     if not pairs:
         raise ValueError("pairs must hold at least one pair, got an empty sequence")
     for b, (image0, image1) in enumerate(pairs):
-        if image0.ndim != 3 or image0.shape[-2:] != image1.shape[-2:]:
+        if image0.ndim != 3 or (rectified is True and image0.shape[-2:] != image1.shape[-2:]):
             shapes = f"{tuple(image0.shape)} and {tuple(image1.shape)}"
             raise ValueError(f"image0 and image1 of pair {b} must be (C, H, W) of one size, got {shapes}")
     return [(to_gray(image0[None]), to_gray(image1[None])) for image0, image1 in pairs]
@@ -177,7 +178,7 @@ def score_pairs(
 
     Args:
         gray: as :func:`to_gray_pairs` gives them; the score ``learned`` looks at them.
-        matches: of these pairs, rectified.
+        matches: of these pairs.
         graphs: of these matches.
         config: names the score; ``none`` gives None.
     """

@@ -130,13 +130,13 @@ void bind_matches(nb::module_& module) {
     module.def("relate", &relate, nb::arg("overlap"), nb::arg("degree0"), nb::arg("degree1"), nb::arg("group_size"),
                nb::arg("min_group_size"), nb::arg("accept_subsets"));
     module.def("consensus_belief", &consensus_belief, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("ptr"),
-               nb::arg("cost").none(), nb::arg("row_offset").none(), nb::arg("found1").none(), nb::arg("crow0"), nb::arg("cols0"),
-               nb::arg("crow1"), nb::arg("cols1"), nb::arg("tolerance"), nb::arg("whole_tolerance"),
-               nb::arg("row_tolerance").none(), nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"),
+               nb::arg("cost").none(), nb::arg("row_offset").none(), nb::arg("found1").none(), nb::arg("crow0"),
+               nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"), nb::arg("tolerance"), nb::arg("whole_tolerance"),
+               nb::arg("row_tolerance"), nb::arg("whole_row_tolerance"), nb::arg("slope"), nb::arg("reach"),
                nb::arg("doubt"), nb::arg("cost_weight"), nb::arg("num_rounds"), nb::arg("num_threads"));
     module.def("agreeing_neighbors", &agreeing_neighbors, nb::arg("points0"), nb::arg("points1"), nb::arg("crow0"),
                nb::arg("cols0"), nb::arg("crow1"), nb::arg("cols1"), nb::arg("row_px"), nb::arg("disparity_px"),
-               nb::arg("slope"), nb::arg("num_threads"));
+               nb::arg("slope"), nb::arg("spread"), nb::arg("num_threads"));
     module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),
                nb::arg("cost").none(), nb::arg("num_threads"));
     module.def("gated_ssd", &gated_ssd, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("descriptors0"),

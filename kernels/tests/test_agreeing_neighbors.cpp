@@ -11,9 +11,13 @@ TEST(agreeing_neighbors_are_counted_in_each_view) {
     const std::int64_t crow0[] = {0, 2, 3, 4}, cols0[] = {1, 2, 0, 0}, crow1[] = {0, 1, 3, 4}, cols1[] = {1, 0, 2, 1};
     std::int64_t count[3];
     for (const int num_threads : {1, 4}) {
-        ts::agreeing_neighbors(points0, points1, crow0, cols0, crow1, cols1, 3, 1.0, 2.0, 0.0, num_threads, count);
+        ts::agreeing_neighbors(points0, points1, crow0, cols0, crow1, cols1, 3, 1.0, 2.0, 0.0, 0.0, num_threads, count);
         EXPECT(count[0] == 2 && count[1] == 3 && count[2] == 1);  // both differences are just allowed
-        ts::agreeing_neighbors(points0, points1, crow0, cols0, crow1, cols1, 3, 1.0, 1.0, 0.05, num_threads, count);
+        ts::agreeing_neighbors(points0, points1, crow0, cols0, crow1, cols1, 3, 1.0, 1.0, 0.05, 0.0, num_threads,
+                               count);
         EXPECT(count[0] == 0 && count[1] == 0 && count[2] == 0);  // 2 px are beyond 1 + .05 * 10
+        ts::agreeing_neighbors(points0, points1, crow0, cols0, crow1, cols1, 3, 0.5, 1.5, 0.0, 0.05, num_threads,
+                               count);
+        EXPECT(count[0] == 2 && count[1] == 3 && count[2] == 1);  // as far as the first, both 10 px away
     }
 }

@@ -18,7 +18,7 @@ constexpr ts::ConsensusSettings kSettings{0.6, 1.0, 0.25, 1.5, 0.2, 2.0, 1.0, 0.
 
 // Matches of a sloped surface with some noise, of which every `wrong`-th is displaced; 0: none.
 struct ConsensusSample {
-    std::vector<double> keypoints[2], cost, row_shift;
+    std::vector<double> keypoints[2], cost, row_offset;
     std::vector<std::int64_t> ptr{0};
 
     void add_pair(std::mt19937_64& rng, int count, int wrong) {
@@ -28,6 +28,7 @@ struct ConsensusSample {
             keypoints[0].insert(keypoints[0].end(), {x, y});
             keypoints[1].insert(keypoints[1].end(), {0.9 * x - 5 + miss + 0.1 * unit(rng), y + 0.1 * unit(rng)});
             cost.push_back(100 * unit(rng) + miss);
+            row_offset.push_back(y - keypoints[1].back());
         }
         ptr.push_back(static_cast<std::int64_t>(cost.size()));
     }
@@ -47,7 +48,8 @@ struct ConsensusSample {
                 ptr.data(),
                 num_pairs,
                 cost.data(),
-                row_shift.empty() ? nullptr : row_shift.data(),
+                row_offset.empty() ? nullptr : row_offset.data(),
+                {keypoints[0].data(), keypoints[1].data()},
                 {graph0.crow.get(), graph1.crow.get()},
                 {graph0.cols.get(), graph1.cols.get()}},
                settings, num_threads, result.data());
@@ -83,7 +85,7 @@ TEST(consensus_without_neighbours_is_zero) {
     auto settings = kSettings;
     settings.num_rounds = 0;
     settings.cost_weight = 0;
-    settings.row_tolerance.reset();
+    sample.row_offset.clear();
     for (const double belief : sample.belief(settings, 2)) EXPECT(belief == 0.5);
 }
 
@@ -101,6 +103,7 @@ TEST(consensus_does_not_depend_on_threads_or_batches) {
             single.keypoints[v].assign(first + 2 * begin, first + 2 * end);
         }
         single.cost.assign(sample.cost.begin() + begin, sample.cost.begin() + end);
+        single.row_offset.assign(sample.row_offset.begin() + begin, sample.row_offset.begin() + end);
         single.ptr.push_back(end - begin);
         EXPECT(single.belief(kSettings, 1) == std::vector<double>(one.begin() + begin, one.begin() + end));
     }
@@ -114,7 +117,7 @@ TEST(vector_types_and_plain_numbers_give_the_same_bits) {
             for (const int count : {0, 1, 2, 3, 40, 700, 3000}) sample.add_pair(rng, count, 4);
             auto settings = kSettings;
             settings.num_rounds = num_rounds;
-            if (!has_rows) settings.row_tolerance.reset();
+            if (!has_rows) sample.row_offset.clear();
             const auto own = sample.belief(settings, 1);
             const auto plain = sample.belief(settings, 1, ts::plain_consensus_belief);
             for (std::size_t k = 0; k < own.size(); ++k) {

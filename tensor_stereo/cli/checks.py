@@ -64,9 +64,7 @@ def _check_filter(command: Filter) -> None:
         check_score_name(command.score_name)
         find_match_files(command.matches, command.out, command.keypoints)
         return
-    ending = check_files(command.matches, command.out, command.keypoints, command.score_name)
-    if ending != ".npz":  # an archive is opened later, to see what form it has
-        command.config.resolve(rectified=ending not in (".h5", ".db"))
+    check_files(command.matches, command.out, command.keypoints, command.score_name)
 
 
 def parse_shard(text: str) -> tuple[int, int]:

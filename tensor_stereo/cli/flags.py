@@ -36,10 +36,8 @@ def name_flags(message: str) -> str:
     message = re.sub(r"(?<= as )(source)(?= does)", lambda found: _flag(found[1]), message)
     message = re.sub(r"(another (?:file|folder) than )(\w+)", lambda found: found[1] + _flag(found[2]), message)
     message = re.sub(rf"(?<=must be None beside )({names})\b", lambda found: _flag(found[1]), message)
-    return message.replace("the verdict 'score'", "--verdict score").replace(
-        "the score 'consensus' with consensus=UNRECTIFIED, or the verdict 'cardinality'",
-        "--score consensus --consensus.row-tolerance-px None, or --verdict cardinality",
-    )
+    message = message.replace("the verdict 'score'", "--verdict score")
+    return message.replace("set rectified=False, or 'auto'", "say --rectified False, or auto")
 
 
 def _flag(name: str) -> str:

@@ -8,13 +8,13 @@ are half a pixel larger than those of this library. The converters leave them so
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tensor_stereo.batching import lengths_to_ptr
+from tensor_stereo.configs import ConsensusConfig
 from tensor_stereo.modules import DelaunayFilter, FilterOutput
 from tensor_stereo.types import Matches, check_mask, check_tensor, check_vector
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 from tensor_stereo.atomic import whole_file
@@ -11,7 +11,7 @@ from tensor_stereo.interop.colmap import filter_colmap
 from tensor_stereo.interop.formats import check_files
 from tensor_stereo.interop.hdf5_matches import filter_hdf5
 from tensor_stereo.interop.match_tables import filter_table
-from tensor_stereo.interop.npz import filter_npz, is_rectified
+from tensor_stereo.interop.npz import filter_npz
 from tensor_stereo.interop.verdicts import FilterSummary
 from tensor_stereo.modules import DelaunayFilter
 
@@ -37,12 +37,9 @@ def filter_file(
     ============  ==================================================================================================
 
     Verdict and score are those of :class:`~tensor_stereo.DelaunayFilter` on all pairs as one batch, in blocks of
-    bounded size, with coordinates in float64. Files of rows are taken to come from rectified pairs, and a match is kept
-    if its probability is at least .5. The forms of other tools (``.h5``, ``.db``, and ``.npz`` with index arrays or of
-    detector-free matchers) are not: there the default verdict is ``cardinality``, with a ``consensus`` score for any
-    two views. Pairs with few or no matches
-    are UNTESTED. Files are data only: nothing in them is run, unpickled or taken for a path, and no
-    size in them is believed before it is checked.
+    bounded size, with coordinates in float64: a match is kept if its probability is at least .5. Whether a pair is
+    rectified its matches tell, unless the settings do. Pairs with few or no matches are UNTESTED. Files are data only:
+    nothing in them is run, unpickled or taken for a path, and no size in them is believed before it is checked.
 
     Args:
         source: file of putative matches. It is not changed.
@@ -51,9 +48,7 @@ def filter_file(
         keypoints: The file of keypoints that belongs to an ``.h5`` file of hloc or DISK; None for all others.
         score_name: Name of the column or array of the score; None: ``score``, or ``filter_score`` beside a ``score`` of
             the user's. For ``.npz``, ``.csv`` and ``.parquet`` only.
-        config: Settings of verdict and score; None, or ``verdict=None`` of a
-            :class:`~tensor_stereo.configs.FileFilterConfig`, leaves the verdict to the form of the file. In files of
-            any two views, ``consensus`` looks at no row offset unless its settings are given.
+        config: Settings of verdict and score; None means :class:`~tensor_stereo.configs.FileFilterConfig`.
 
     Returns:
         Counts of pairs and matches.
@@ -77,9 +72,7 @@ def filter_file(
     source, out = Path(source), Path(out)
     keypoints = None if keypoints is None else Path(keypoints)
     ending = check_files(source, out, keypoints, score_name)
-    settings = {} if config is None else {f.name: getattr(config, f.name) for f in fields(FilterConfig)}
-    of_any_views = ending in (".h5", ".db") or (ending == ".npz" and not is_rectified(source))
-    config = FileFilterConfig(**settings).resolve(rectified=not of_any_views)
+    config = FileFilterConfig() if config is None else config
     if config.resolved_score == "none":
         config = replace(config, score="none")  # nobody asks for a gradient here
     run = DelaunayFilter(config)

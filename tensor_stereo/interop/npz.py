@@ -73,16 +73,6 @@ def _headers_of_python_2() -> Iterator[None]:
         yield
 
 
-def is_rectified(source: Path) -> bool:
-    """Whether the form of an archive promises rectified pairs; True if it is damaged, which is found later."""
-    try:
-        with zipfile.ZipFile(source) as archive, _headers_of_python_2():
-            members = _check_members(source, archive)
-        return find_form(str(source), {name: header for name, (_, header) in members.items()}).is_rectified
-    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError):
-        return True
-
-
 def _earlier(members: Mapping[str, tuple[zipfile.ZipInfo, Header]]) -> set[str]:
     """The arrays that an earlier filter wrote."""
     for names in earlier_results(list(members)):

@@ -62,14 +62,12 @@ class Form:
         points1: Name of the keypoints of view 1.
         arrays: Names of all arrays that say something of the matches.
         has_indices: Whether index arrays name the partners; else rows are matches.
-        is_rectified: Whether the form promises rectified pairs.
     """
 
     points0: str
     points1: str
     arrays: tuple[str, ...]
     has_indices: bool
-    is_rectified: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +103,7 @@ def find_form(place: str, headers: Mapping[str, Header]) -> Form:
 
     >>> points = Header((4, 2), np.dtype(float))
     >>> form = find_form("m.npz", {"mkpts0": points, "mkpts1": points})
-    >>> form.points0, form.has_indices, form.is_rectified
+    >>> form.points0, form.has_indices
     ('mkpts0', False, False)
     """
     if any(name in headers for name in INDEX_ARRAYS):
@@ -129,7 +127,7 @@ def find_form(place: str, headers: Mapping[str, Header]) -> Form:
             length for name in (*_POINTS, *views) if name in headers for length in headers[name].shape[:-1]
         }
         _refuse_unread(place, headers, known, tuple(num_keypoints - {1}))
-    return Form(*views, arrays, has_indices=False, is_rectified=not (has_matched or of_others))
+    return Form(*views, arrays, has_indices=False)
 
 
 def _indexed_form(place: str, headers: Mapping[str, Header]) -> Form:
@@ -141,7 +139,7 @@ def _indexed_form(place: str, headers: Mapping[str, Header]) -> Form:
         if name in headers:
             raise ValueError(f"{place} holds {indices[0]!r} of one pair, so that {name!r} has no meaning")
     scores = [name for index in indices[:1] for name in INDEX_ARRAYS[index] if name in headers]
-    return Form(*_POINTS, (*_POINTS, *indices, *scores), has_indices=True, is_rectified=False)
+    return Form(*_POINTS, (*_POINTS, *indices, *scores), has_indices=True)
 
 
 def _refuse_unread(place: str, headers: Mapping[str, Header], known: set[str], num_keypoints: tuple[int, ...]) -> None:

@@ -96,8 +96,8 @@ def consensus_belief(
         backend: a name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
-        (M,) float64 in [0, 1). Gradients flow to both point sets, the cost and the row offset. The backward pass runs plain torch again
-        under either back end, so that gradients can be differentiated again.
+        (M,) float64 in [0, 1). Gradients flow to both point sets, the cost and the row offset. The backward pass
+        runs plain torch again under either back end, so that gradients can be differentiated again.
 
     Example:
         >>> points, ptr, crow = torch.tensor([[0.0, 0.0], [9.0, 0.0]]), torch.tensor([0, 2]), torch.tensor([0, 1, 2])

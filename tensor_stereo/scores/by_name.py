@@ -13,7 +13,7 @@ from tensor_stereo.scores.alignment import Alignment, estimate_alignment
 from tensor_stereo.scores.consensus import consensus_probabilities
 from tensor_stereo.scores.domain import check_domain, check_images
 from tensor_stereo.scores.image_evidence import ImageEvidence, measure_images
-from tensor_stereo.scores.learned import LearnedScore, learned_probabilities
+from tensor_stereo.scores.learned import LearnedNetworks, LearnedScore, learned_probabilities
 from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.soft import build_soft_graphs, count_soft_neighbors, soft_jaccard
 from tensor_stereo.types import Matches
@@ -52,7 +52,7 @@ def score_matches(
     evidence: ImageEvidence | None = None,
     alignment: Alignment | None = None,
     temperature: Tensor | None = None,
-    network: LearnedScore | None = None,
+    network: LearnedScore | LearnedNetworks | None = None,
 ) -> ScoredMatches:
     """Score every match, by the score that the settings name.
 

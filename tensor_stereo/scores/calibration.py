@@ -39,7 +39,9 @@ def calibrate_consensus(belief: Tensor, kind: Tensor | None = None) -> Tensor:
     """
     # Linear between knots: exponentials would differ in the last bit between a vector's lanes and its rest, and a batch
     # would not equal the loop over its pairs.
-    slope, bias = torch.tensor(_CONSENSUS, dtype=torch.float64, device=belief.device).transpose(0, 1)[..., None].unbind(2)
+    slope, bias = (
+        torch.tensor(_CONSENSUS, dtype=torch.float64, device=belief.device).transpose(0, 1)[..., None].unbind(2)
+    )
     end = math.log((1 - _LEAST) / _LEAST)
     logits = torch.linspace(-end, end, _NUM_KNOTS + 1, dtype=torch.float64, device=belief.device)
     knots, values = torch.sigmoid(logits), torch.sigmoid(slope * logits + bias)  # (K,), (5, 3, K)

@@ -168,9 +168,7 @@ def _displacements(
         return right, matches.ptr, matches.cost, row_offset, None
     batch = ptr_to_batch(matches.ptr)
     frames = epipolar_frames(matches, alignment)
-    is_rectified, has_rows = (
-        values.index_select(0, batch) for values in (alignment.rectified, alignment.has_rows)
-    )
+    is_rectified, has_rows = (values.index_select(0, batch) for values in (alignment.rectified, alignment.has_rows))
     off = torch.where(has_rows, -frames.moved[:, 1], 0)
     row_offset = torch.where(is_rectified, row_offset, off)
     is_rectified = is_rectified[:, None]

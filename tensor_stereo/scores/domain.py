@@ -104,7 +104,7 @@ def check_domain(
         )
         _warn(
             of_views,
-            "the score expects that one map of view 0 to view 1, or one motion, explains most of the matches that agree "
+            "the score expects that one map between the views, or one motion, explains most of the matches that agree "
             "with their neighbours, but those of {pairs} have none in common",
         )
         _warn(

@@ -4,12 +4,12 @@ Every match starts from its own quantities and, where there are images, from wha
 rounds it hears from its neighbours in either view, through what lies between both; in the last it also looks at the
 plane through the neighbours that are believed so far. Costs and images may be missing: training has left them out at
 random, and without them the network adds nothing in their place. It says how likely the error stays within each of five
-tolerances.
+tolerances. One network has learnt from rectified pairs, another from any two views.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.scores.alignment.form import Alignment
@@ -35,7 +36,10 @@ from tensor_stereo.scores.planes import NUM_PLANE, NUM_REFINED_PLANE, plane_colu
 from tensor_stereo.scores.tolerance import NUM_TOLERANCES, probability_within, rising
 from tensor_stereo.types import Adjacency, Matches
 
-WEIGHTS = Path(__file__).with_name("weights.safetensors")
+WEIGHTS = {
+    rectified: Path(__file__).with_name(f"weights_{name}.safetensors")
+    for rectified, name in ((True, "rectified"), (False, "views"))
+}
 _MATCHES_AT_ONCE = 8192  # whose edges stay in the cache, and are enough for two threads
 _WIDTH, _EDGE_WIDTH, _ROUNDS = 24, 12, 3
 _MAX_NORMALIZED = 4.0  # standard deviations
@@ -91,7 +95,7 @@ class LearnedScore(nn.Module):
             graphs: of the same matches.
             evidence: of their images, or None.
             config: ``backend`` is read; None means the defaults.
-            alignment: Where the rows of view 0 lie in view 1; None: they are the same.
+            alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
 
         Returns:
             (M, 5) float32 each, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`. Gradients flow to the
@@ -187,12 +191,40 @@ def _pair_mean(state: Tensor, q: Quantities) -> Tensor:
     return state.new_zeros(q.num_pairs, state.shape[1]).index_add(0, q.batch, state * q.share)
 
 
+class LearnedNetworks(nn.Module):
+    """A network for rectified pairs, another for pairs of any two views, or one of them.
+
+    Args:
+        rectified: The network of rectified pairs, or None.
+        views: The network of other pairs, or None.
+    """
+
+    def __init__(self, rectified: LearnedScore | None, views: LearnedScore | None) -> None:
+        super().__init__()
+        self.rectified, self.views = rectified, views
+
+    def of(self, *, rectified: bool) -> LearnedScore:
+        """The network for one kind of pairs.
+
+        Raises:
+            ValueError: if there is none.
+
+        >>> LearnedNetworks(load_learned(), None).of(rectified=True) is load_learned()
+        True
+        """
+        found = self.rectified if rectified else self.views
+        if found is None:
+            raise ValueError(f"alignment must be of pairs with rectified={not rectified}, as the network is")
+        return found
+
+
 @cache
-def load_learned(device: torch.device | None = None) -> LearnedScore:
+def load_learned(device: torch.device | None = None, *, rectified: bool = True) -> LearnedScore:
     """The network with the weights of this package, in evaluation mode and without gradients of its weights.
 
     Args:
         device: where it runs; None: the CPU.
+        rectified: Whether it is that of rectified pairs.
 
     Returns:
         One network per device and process, shared by all callers.
@@ -204,7 +236,7 @@ def load_learned(device: torch.device | None = None) -> LearnedScore:
 
     with torch.inference_mode(False):  # weights that were made in it could never take part in a gradient
         network = LearnedScore().float()
-        network.load_state_dict(load_file(WEIGHTS))
+        network.load_state_dict(load_file(WEIGHTS[rectified]))
         return network.requires_grad_(False).eval().to(device or torch.device("cpu"))
 
 
@@ -215,17 +247,18 @@ def score_learned(
     config: FilterConfig | None = None,
     *,
     alignment: Alignment | None = None,
-    network: LearnedScore | None = None,
+    network: LearnedScore | LearnedNetworks | None = None,
 ) -> Tensor:
     """Calibrated probability of every match being correct.
 
     Args:
-        matches: B pairs of rectified views; ``cost`` may be missing.
+        matches: B pairs; ``cost`` may be missing.
         graphs: The graphs of the same matches.
         evidence: What their images say, or None.
         config: ``max_error_px`` and ``backend`` are read; None means the defaults.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
-        network: The network that scores; None means the one with the weights of this package.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
+        network: The network that scores all pairs; None means those with the weights of this package, one for rectified
+            pairs and one for others.
 
     Returns:
         (M,) float32 probability of an error of at most ``max_error_px``, of :func:`learned_probabilities`.
@@ -255,17 +288,18 @@ def learned_probabilities(
     config: FilterConfig | None = None,
     *,
     alignment: Alignment | None = None,
-    network: LearnedScore | None = None,
+    network: LearnedScore | LearnedNetworks | None = None,
 ) -> Tensor:
     """Calibrated probabilities of every match being correct within each tolerance.
 
     Args:
-        matches: B pairs of rectified views; ``cost`` may be missing.
+        matches: B pairs; ``cost`` may be missing.
         graphs: The graphs of the same matches.
         evidence: What their images say, or None.
         config: ``backend`` is read; None means the defaults.
-        alignment: Where the rows of view 0 lie in view 1; None: they are the same.
-        network: The network that scores; None means the one with the weights of this package.
+        alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
+        network: The network that scores all pairs; None means those with the weights of this package, one for rectified
+            pairs and one for others.
 
     Returns:
         (M, 5) float32, for :data:`tensor_stereo.scores.tolerance.TOLERANCES_PX`; no row falls. A match that is no
@@ -282,28 +316,58 @@ def learned_probabilities(
     torch.Size([50, 5])
     """
     check_fit(matches, graphs, evidence)
-    network = load_learned(matches.keypoints0.device) if network is None else network
-    if torch.compiler.is_compiling():  # the lengths of the pairs are not known yet
-        _, probability = network(matches, graphs, evidence, config, alignment)
-        return probability  # type: ignore[no-any-return]
-    parts = [
-        network(part, own, seen, config, None if alignment is None else alignment.select(*pairs))[1]
-        for pairs, part, own, seen in _parts(matches, graphs, evidence)
-    ]
+    if torch.compiler.is_compiling():  # neither the lengths of the pairs nor their kinds are known yet
+        return _score_compiled(matches, graphs, evidence, config, alignment, network)
+    kinds = [True] * matches.num_pairs if alignment is None else alignment.rectified.tolist()
+    parts = []
+    for (first, last), part, own, seen in _parts(matches, graphs, evidence, kinds):
+        shared = None if alignment is None else alignment.select(first, last)
+        parts.append(_of_kind(network, matches, rectified=kinds[first])(part, own, seen, config, shared)[1])
     if not parts:
         return (matches.keypoints0 + matches.keypoints1).float()[:, :1].expand(-1, NUM_TOLERANCES)  # with a gradient
     return torch.cat(parts)
 
 
+def _of_kind(network: LearnedScore | LearnedNetworks | None, matches: Matches, *, rectified: bool) -> LearnedScore:
+    if network is None:
+        return load_learned(matches.keypoints0.device, rectified=rectified)
+    return network.of(rectified=rectified) if isinstance(network, LearnedNetworks) else network
+
+
+def _score_compiled(
+    matches: Matches,
+    graphs: MatchGraphs,
+    evidence: ImageEvidence | None,
+    config: FilterConfig | None,
+    alignment: Alignment | None,
+    network: LearnedScore | LearnedNetworks | None,
+) -> Tensor:
+    """By every network that may be needed, all pairs at once."""
+    given = matches, graphs, evidence, config, alignment
+    if isinstance(network, LearnedScore):
+        return network(*given)[1]  # type: ignore[no-any-return]
+    if alignment is None or (network is not None and network.views is None):
+        return _of_kind(network, matches, rectified=True)(*given)[1]  # type: ignore[no-any-return]
+    of_views: Tensor = _of_kind(network, matches, rectified=False)(*given)[1]
+    if network is not None and network.rectified is None:
+        return of_views
+    is_rectified = alignment.rectified.index_select(0, ptr_to_batch(matches.ptr))[:, None]
+    return torch.where(is_rectified, _of_kind(network, matches, rectified=True)(*given)[1], of_views)
+
+
 def _parts(
-    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None
+    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None, kinds: Sequence[bool]
 ) -> Iterator[tuple[tuple[int, int], Matches, MatchGraphs, ImageEvidence | None]]:
-    """Runs of pairs whose matches number about :data:`_MATCHES_AT_ONCE`."""
+    """Runs of pairs of one kind whose matches number about :data:`_MATCHES_AT_ONCE`."""
     offsets = matches.ptr.tolist()
     first = 0
     while first < matches.num_pairs:
         last = first + 1
-        while last < matches.num_pairs and offsets[last + 1] - offsets[first] <= _MATCHES_AT_ONCE:
+        while (
+            last < matches.num_pairs
+            and kinds[last] == kinds[first]
+            and offsets[last + 1] - offsets[first] <= _MATCHES_AT_ONCE
+        ):
             last += 1
         rows = slice(offsets[first], offsets[last])
         ptr = matches.ptr[first : last + 1] - rows.start

@@ -62,9 +62,7 @@ def find_places(matches: Matches, aligned: Matches, graphs: MatchGraphs, alignme
         across = torch.where(is_rectified, across, line_row)
         c, s = frames.turn.index_select(0, batch).unbind(1)
         cosine, sine = (c * x + s * y).float(), (c * y - s * x).float()
-        turned = torch.stack(
-            [cosine * slope[:, 0] + sine * slope[:, 1], cosine * slope[:, 1] - sine * slope[:, 0]], 1
-        )
+        turned = torch.stack([cosine * slope[:, 0] + sine * slope[:, 1], cosine * slope[:, 1] - sine * slope[:, 0]], 1)
         is_rectified = is_rectified[:, None]
         right = torch.where(is_rectified, right.double(), frames.partners)
         along = torch.where(is_rectified, along, frames.along.float())
@@ -94,7 +92,7 @@ class RowSampler(NamedTuple):
         x = start[:, :1] + torch.arange(count, device=start.device)
         return (x < 0) | (x > self.image.shape[1] - 1)
 
-    def select(self, rows: slice) -> RowSampler:
+    def select(self, rows: slice) -> RowSampler:  # noqa: ARG002  # as of other samplers
         """That of some matches."""
         return self
 
@@ -219,7 +217,7 @@ def _finer(to_view0: Tensor, keypoints1: Tensor) -> float:
     x, y = keypoints1.double().median(0).values.tolist()
     depth = abs(float(to_view0[2, 0]) * x + float(to_view0[2, 1]) * y + float(to_view0[2, 2]))
     area = abs(float(torch.linalg.det(to_view0))) / max(depth, 1e-3) ** 3
-    return min(max(area, 1e-4), 1e4) ** -0.5
+    return 1 / math.sqrt(min(max(area, 1e-4), 1e4))
 
 
 def _blur(image: Tensor, px_per_px: float) -> Tensor:

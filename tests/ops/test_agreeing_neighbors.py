@@ -8,7 +8,7 @@ from tensor_stereo.ops import agreeing_neighbors
 from tensor_stereo.types import Matches
 from tests.oracles import installed_backends, neighbor_sets
 
-LIMITS = (1.0, 2.0, 0.2)
+LIMITS = (1.0, 2.0, 0.2, 0.0)
 
 
 def _given(lengths: tuple[int, ...], dtype: torch.dtype) -> tuple[Matches, tuple[torch.Tensor, ...]]:
@@ -24,9 +24,12 @@ def _given(lengths: tuple[int, ...], dtype: torch.dtype) -> tuple[Matches, tuple
 @pytest.mark.parametrize("backend", installed_backends())
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("lengths", [(), (0, 1), (40, 0, 70)])
-def test_every_back_end_counts_sets_of_neighbors(backend: str, dtype: torch.dtype, lengths: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("spread", [0.0, 0.0625])
+def test_every_back_end_counts_sets_of_neighbors(
+    backend: str, dtype: torch.dtype, lengths: tuple[int, ...], spread: float
+) -> None:
     matches, graphs = _given(lengths, dtype)
-    found = agreeing_neighbors(matches.keypoints0, matches.keypoints1, *graphs, *LIMITS, backend)
+    found = agreeing_neighbors(matches.keypoints0, matches.keypoints1, *graphs, *LIMITS[:3], spread, backend)
     views = [neighbor_sets(view) for view in build_match_graphs(matches)[:2]]
     left, right = (view.double().tolist() for view in (matches.keypoints0, matches.keypoints1))
     expected = []
@@ -35,7 +38,9 @@ def test_every_back_end_counts_sets_of_neighbors(backend: str, dtype: torch.dtyp
         for j in [*views[0][i], *views[1][i]]:
             row = abs((right[i][1] - left[i][1]) - (right[j][1] - left[j][1]))
             disparity = abs((left[i][0] - right[i][0]) - (left[j][0] - right[j][0]))
-            count += row <= 1 and disparity <= 2 + 0.2 * abs(left[i][0] - left[j][0])
+            way_x, way_y = (abs(left[i][k] - left[j][k]) for k in (0, 1))
+            more = spread * (way_x + way_y)
+            count += row <= 1 + more and disparity <= 2 + 0.2 * way_x + more
         expected.append(count)
     assert found.dtype == torch.int64
     assert found.tolist() == expected

@@ -20,7 +20,7 @@ from tests.point_sets import GENERATORS, distinct_points
 
 NATIVE = pytest.mark.skipif("native" not in installed_backends(), reason="the native kernels are not installed")
 DEFAULTS = (0.6, 1.0, 0.25, 1.5, 0.2, 2.0, 1.0, 0.5, 2)
-UNRECTIFIED = (0.5, 2.0, None, 1.0, 0.1, 1.5, 2.0, 0.0, 3)
+OTHERS = (0.5, 2.0, 0.5, 1.0, 0.1, 1.5, 2.0, 0.0, 3)
 SMOOTH = (0.6, 0.6, 0.25, 0.25, 0.2, 2.0, 1.0, 0.5, 2)  # without the step that the choice of the tolerance is
 
 
@@ -40,12 +40,19 @@ def _matches(seed: int, lengths: tuple[int, ...] = (200, 1, 0, 57, 2, 3), *, who
 def _arguments(matches: Matches, graphs: MatchGraphs | None = None) -> tuple[Any, ...]:
     graph0, graph1, _ = build_match_graphs(matches) if graphs is None else graphs
     patterns = graph0.crow_indices, graph0.col_indices, graph1.crow_indices, graph1.col_indices
-    row_shift = 0.5 + 0.01 * matches.keypoints0[:, 0]
-    return matches.keypoints0, matches.keypoints1, matches.ptr, matches.cost, row_shift, *patterns
+    row_shift = 0.5 + 0.01 * matches.keypoints0[:, 0].double()
+    row_offset = matches.keypoints0[:, 1].double() - matches.keypoints1[:, 1].double() + row_shift
+    return matches.keypoints0, matches.keypoints1, matches.ptr, matches.cost, row_offset, None, *patterns
 
 
 def _assert_same(matches: Matches, settings: tuple[Any, ...]) -> None:
-    arguments = _arguments(matches)
+    _assert_same_of(_arguments(matches), settings)
+    arguments = list(_arguments(matches))
+    arguments[4], arguments[5] = None, matches.keypoints0  # no rows, another grid
+    _assert_same_of(tuple(arguments), settings)
+
+
+def _assert_same_of(arguments: tuple[Any, ...], settings: tuple[Any, ...]) -> None:
     native, plain = (consensus_belief(*arguments, *settings, backend) for backend in ("native", "scipy"))
     assert native.dtype == plain.dtype == torch.float64
     # Exponentials that differ in the last bits; beliefs near zero are products of many.
@@ -53,7 +60,7 @@ def _assert_same(matches: Matches, settings: tuple[Any, ...]) -> None:
 
 
 @NATIVE
-@pytest.mark.parametrize("settings", [DEFAULTS, UNRECTIFIED, (*DEFAULTS[:-1], 0)])
+@pytest.mark.parametrize("settings", [DEFAULTS, OTHERS, (*DEFAULTS[:-1], 0)])
 @pytest.mark.parametrize("whole", [False, True])
 def test_kernel_equals_plain_torch(whole: bool, settings: tuple[Any, ...]) -> None:
     for seed in range(5):
@@ -97,23 +104,23 @@ def test_beliefs_are_those_of_least_squares_match_by_match(backend: str, whole: 
             for graph in graphs[:2]
         ]
         views = [points[start:stop].numpy() for points in (matches.keypoints0, matches.keypoints1)]
-        shift = _arguments(matches)[4][start:stop].numpy()
-        expected = _believe(views, matches.cost[start:stop].numpy(), shift, neighbors)
+        offset = _arguments(matches)[4][start:stop].numpy()
+        expected = _believe(views, matches.cost[start:stop].numpy(), offset, neighbors)
         np.testing.assert_allclose(belief[start:stop].numpy(), expected, rtol=1e-9, atol=1e-15)
 
 
 def _believe(
-    views: list[np.ndarray], cost: np.ndarray, shift: np.ndarray, neighbors: list[list[list[int]]]
+    views: list[np.ndarray], cost: np.ndarray, offset: np.ndarray, neighbors: list[list[list[int]]]
 ) -> np.ndarray:
     """The definition with the default settings: planes by numpy's least squares over stacked, weighted observations."""
     tolerance, whole_tolerance, row_tolerance, whole_row_tolerance, slope, reach, doubt, cost_weight, rounds = DEFAULTS
     columns = [view[:, k] for view in views for k in (0, 1)]
-    *shares, last, moved_share = (float(abs(np.exp(2j * np.pi * x).mean())) for x in (*columns, columns[3] - shift))
+    *shares, last, moved_share = (float(abs(np.exp(2j * np.pi * x).mean())) for x in (*columns, columns[1] - offset))
     whole = math.prod(shares) * max(last, moved_share)
     sigma = (1 - whole) * tolerance + whole * whole_tolerance
     row_sigma = (1 - whole) * row_tolerance + whole * whole_row_tolerance
     level = np.log(cost + cost.mean() / 100)
-    evidence = -np.log1p(((views[0][:, 1] - views[1][:, 1] + shift) / row_sigma) ** 2)
+    evidence = -np.log1p((offset / row_sigma) ** 2)
     evidence -= cost_weight * (level - level.mean()) / np.hypot(level.std(), 0.1)
     odds = np.exp(np.clip(evidence, -8, 8))
     middle, moved = (views[0] + views[1]) / 2 / sigma, (views[1] - views[0]) / sigma
@@ -171,12 +178,12 @@ def test_thread_count_and_batch_change_no_bit(whole: bool) -> None:
 def test_gradients_are_those_of_plain_torch(backend: str, has_cost: bool) -> None:
     matches = _matches(5)
     fixed = _arguments(matches)
-    inputs = [values for values in fixed[:4] if values.is_floating_point()][: 3 if has_cost else 2]
+    inputs = [fixed[k] for k in ((0, 1, 4, 3) if has_cost else (0, 1, 4))]
 
     def gradients(function: Any) -> tuple[torch.Tensor, ...]:
         leaves = [values.clone().requires_grad_() for values in inputs]
-        cost = leaves[2] if has_cost else None
-        belief = function(*leaves[:2], matches.ptr, cost, *fixed[4:])
+        cost = leaves[3] if has_cost else None
+        belief = function(*leaves[:2], matches.ptr, cost, leaves[2], *fixed[5:])
         weights = torch.linspace(-1, 1, len(belief), dtype=torch.float64)
         return torch.autograd.grad((weights * belief).sum(), leaves)
 
@@ -192,12 +199,12 @@ def test_gradients_are_those_of_plain_torch(backend: str, has_cost: bool) -> Non
 def test_gradients_pass_through_keypoints_that_are_computed(backend: str) -> None:
     """As in every training loop: the second view follows from the first, and costs from both."""
     matches = _matches(6, (12, 8))
-    keypoints0, keypoints1, ptr, cost, shift, *graphs = _arguments(matches)
+    keypoints0, keypoints1, ptr, cost, offset, found, *graphs = _arguments(matches)
 
     def believe(left: torch.Tensor, way: torch.Tensor) -> torch.Tensor:
         right = left + way
         asked = cost + (left - right).square().sum(1) - 300  # some below zero
-        return consensus_belief(left, right, ptr, asked, shift, *graphs, *SMOOTH, backend)
+        return consensus_belief(left, right, ptr, asked, offset, found, *graphs, *SMOOTH, backend)
 
     leaves = keypoints0.clone().requires_grad_(), (keypoints1 - keypoints0).requires_grad_()
     assert torch.autograd.gradcheck(believe, leaves)
@@ -205,10 +212,10 @@ def test_gradients_pass_through_keypoints_that_are_computed(backend: str) -> Non
 
 @pytest.mark.parametrize("backend", installed_backends())
 def test_beliefs_that_are_constant_have_gradient_zero(backend: str) -> None:
-    keypoints0, keypoints1, ptr, _, shift, *graphs = _arguments(_matches(6, (12, 8)))
+    keypoints0, keypoints1, ptr, _, _, found, *graphs = _arguments(_matches(6, (12, 8)))
     leaf = keypoints0.requires_grad_()
-    settings = (0.5, 2.0, None, 1.0, 0.1, 1.5, 2.0, 0.0, 0)
-    belief = consensus_belief(leaf, keypoints1, ptr, None, shift, *graphs, *settings, backend)
+    settings = (*OTHERS[:-1], 0)
+    belief = consensus_belief(leaf, keypoints1, ptr, None, None, found, *graphs, *settings, backend)
     assert belief.eq(0.5).all()
     if belief.requires_grad:
         belief.sum().backward()
@@ -218,11 +225,11 @@ def test_beliefs_that_are_constant_have_gradient_zero(backend: str) -> None:
 @pytest.mark.parametrize("backend", installed_backends())
 def test_gradients_of_both_orders_are_those_of_finite_differences(backend: str) -> None:
     matches = _matches(6, (12, 8))
-    keypoints0, keypoints1, ptr, cost, shift, *graphs = _arguments(matches)
-    leaves = [values.clone().requires_grad_() for values in (keypoints0, keypoints1, cost)]
+    keypoints0, keypoints1, ptr, cost, offset, found, *graphs = _arguments(matches)
+    leaves = [values.clone().requires_grad_() for values in (keypoints0, keypoints1, cost, offset)]
 
-    def believe(left: torch.Tensor, right: torch.Tensor, cost: torch.Tensor) -> torch.Tensor:
-        return consensus_belief(left, right, ptr, cost, shift, *graphs, *SMOOTH, backend)
+    def believe(left: torch.Tensor, right: torch.Tensor, cost: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+        return consensus_belief(left, right, ptr, cost, offset, found, *graphs, *SMOOTH, backend)
 
     assert torch.autograd.gradcheck(believe, leaves)
     assert torch.autograd.gradgradcheck(believe, leaves)
@@ -232,21 +239,33 @@ def test_gradients_of_both_orders_are_those_of_finite_differences(backend: str) 
 
 @pytest.mark.parametrize("backend", installed_backends())
 def test_gradients_reach_only_what_asks_for_them_and_keep_its_dtype(backend: str) -> None:
-    keypoints0, keypoints1, ptr, cost, shift, *graphs = _arguments(_matches(7))
+    keypoints0, keypoints1, ptr, cost, offset, found, *graphs = _arguments(_matches(7))
     leaf = keypoints1.float().requires_grad_()
-    consensus_belief(keypoints0.float(), leaf, ptr, cost, shift, *graphs, *DEFAULTS, backend).sum().backward()
+    consensus_belief(keypoints0.float(), leaf, ptr, cost, offset, found, *graphs, *DEFAULTS, backend).sum().backward()
     assert leaf.grad.dtype == torch.float32
     assert leaf.grad.isfinite().all()
-    assert not consensus_belief(keypoints0, keypoints1, ptr, cost, shift, *graphs, *DEFAULTS, backend).requires_grad
+    assert not consensus_belief(
+        keypoints0, keypoints1, ptr, cost, offset, found, *graphs, *DEFAULTS, backend
+    ).requires_grad
 
 
 @pytest.mark.slow  # compiles for ten seconds
 @pytest.mark.parametrize("backend", installed_backends())
 @pytest.mark.parametrize("has_cost", [False, True])
 def test_operator_keeps_the_rules_of_torch_and_compiles(backend: str, has_cost: bool) -> None:
-    left, right, ptr, cost, shift, *graphs = _arguments(_matches(8, (20, 9)))
+    left, right, ptr, cost, offset, found, *graphs = _arguments(_matches(8, (20, 9)))
     left, right = left.requires_grad_(), right.requires_grad_()
-    arguments = (left, right, ptr, cost.requires_grad_() if has_cost else None, shift, *graphs, *DEFAULTS, backend)
+    arguments = (
+        left,
+        right,
+        ptr,
+        cost.requires_grad_() if has_cost else None,
+        offset,
+        found,
+        *graphs,
+        *DEFAULTS,
+        backend,
+    )
     torch.library.opcheck(torch.ops.tensor_stereo.consensus_belief.default, arguments)
     compiled = torch.compile(lambda: consensus_belief(*arguments) + 1, fullgraph=True, backend="aot_eager")
     found, expected = compiled(), consensus_belief(*arguments) + 1
@@ -262,12 +281,13 @@ def test_operator_keeps_the_rules_of_torch_and_compiles(backend: str, has_cost: 
         (1, torch.zeros(3, 2), "same length"),
         (2, torch.tensor([0, 3]), "ptr must rise"),
         (3, torch.zeros(3), "cost must have"),
-        (4, torch.zeros(3), "row_shift must have"),
-        (5, torch.tensor([0, 1]), "one row per match"),
-        (7, torch.tensor([0, 2, 1, 1, 2]), "crow1 must rise"),
-        (6, torch.tensor([1, 4]), "cols0 must name"),
-        (8, torch.tensor([-1, 0]), "cols1 must name"),
-        (17, -1, "num_rounds"),
+        (4, torch.zeros(3), "row_offset must have"),
+        (5, torch.zeros(3, 2), "found1 must have"),
+        (6, torch.tensor([0, 1]), "one row per match"),
+        (8, torch.tensor([0, 2, 1, 1, 2]), "crow1 must rise"),
+        (7, torch.tensor([1, 4]), "cols0 must name"),
+        (9, torch.tensor([-1, 0]), "cols1 must name"),
+        (18, -1, "num_rounds"),
     ],
 )
 def test_broken_input_is_refused(position: int, value: object, message: str) -> None:
@@ -276,6 +296,7 @@ def test_broken_input_is_refused(position: int, value: object, message: str) -> 
         points,
         points,
         torch.tensor([0, 4]),
+        None,
         None,
         None,
         crow,

@@ -20,8 +20,8 @@ class Alignment(NamedTuple):
 
     Of a rectified pair they share the rows, ``y1 - y0 = a + b x0 + c y0 + e d`` with disparity d = x0 - x1: affine
     epipolar lines (Shapiro, Zisserman & Brady, IJCV 16, 1995), nearly along the rows, whichever camera is turned; e
-    alone is a baseline that is not level. Of any two views they share a map, which takes view 1 to where its most common
-    surface lies in view 0, and the epipolar lines that the rest of the displacement follows.
+    alone is a baseline that is not level. Of any two views they share a map, which takes view 1 to where its most
+    common surface lies in view 0, and the epipolar lines that the rest of the displacement follows.
 
     Attributes:
         rectified: (B,) bool, what the pair is taken for.
@@ -72,8 +72,8 @@ class EpipolarFrames(NamedTuple):
         partners: (M, 2) float64 px, view 1 taken to view 0; gradients flow to the keypoints of view 1.
         along: (M, 2) float64 unit vectors of view 0 along the line of each match, ``(1, 0)`` without lines; a constant.
             They point to the right in the mean of a pair.
-        moved: (M, 2) float64 px, how far partners lie from their keypoints, along the line and off it; along columns and
-            rows without lines. Gradients flow to the keypoints.
+        moved: (M, 2) float64 px, how far partners lie from their keypoints, along the line and off it; along columns
+            and rows without lines. Gradients flow to the keypoints.
         turn: (B, 2) float64 unit vector, the mean of ``along``; a constant.
     """
 

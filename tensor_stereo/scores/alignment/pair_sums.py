@@ -38,7 +38,8 @@ def select_rows(matches: Matches, chosen: Tensor) -> tuple[Tensor, PairSums]:
     """The rows (K,) where a (M,) mask holds, and the pairs that they belong to.
 
     >>> points = torch.zeros(3, 2)
-    >>> rows, of_pairs = select_rows(Matches(points, points, torch.tensor([0, 2, 3])), torch.tensor([True, False, True]))
+    >>> chosen = torch.tensor([True, False, True])
+    >>> rows, of_pairs = select_rows(Matches(points, points, torch.tensor([0, 2, 3])), chosen)
     >>> rows, of_pairs.ptr
     (tensor([0, 2]), tensor([0, 1, 2]))
     """

@@ -86,9 +86,7 @@ def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") 
         points = normalize(left.index_select(0, rows), partners, pairs)
         affine = fit_affine(points, scales_px) @ affine
     rows, pairs = _agreeing(matches, map_points(affine, right, batch), graphs, _LAST_PX, _LAST_SPREAD, backend)
-    points = normalize(
-        left.index_select(0, rows), map_points(affine, right.index_select(0, rows), pairs.batch), pairs
-    )
+    points = normalize(left.index_select(0, rows), map_points(affine, right.index_select(0, rows), pairs.batch), pairs)
     lines, off_px = fit_lines(points)
     homography, miss_px = fit_homography(points, _MAP_SCALES_PX)
     # the lines hold in the frame of the affine map, and are wanted in that of the homography
@@ -213,7 +211,7 @@ def fit_homography(points: Normalized, scales_px: tuple[float, ...]) -> tuple[Te
             (x, y, one, zero, zero, zero, -u * x, -u * y),
             (zero, zero, zero, x, y, one, -v * x, -v * y),
         )
-        normal, target = 0.0, 0.0
+        normal, target = x.new_zeros(len(found), 8, 8), x.new_zeros(len(found), 8, 1)
         for columns, t in zip(equations, (u - x, v - y), strict=True):
             scaled = [c / depth for c in columns]
             weighted = [weight * c for c in scaled]
@@ -260,7 +258,9 @@ def _agreeing(
     matches: Matches, partners: Tensor, graphs: MatchGraphs, near_px: float, spread: float, backend: Backend
 ) -> tuple[Tensor, PairSums]:
     patterns = [
-        getattr(graph, name) for graph in (graphs.adjacency0, graphs.adjacency1) for name in ("crow_indices", "col_indices")
+        getattr(graph, name)
+        for graph in (graphs.adjacency0, graphs.adjacency1)
+        for name in ("crow_indices", "col_indices")
     ]
     votes = ops.agreeing_neighbors(matches.keypoints0, partners, *patterns, near_px, near_px, 0.0, spread, backend)
     return select_rows(matches, votes >= _LEAST_VOTES)

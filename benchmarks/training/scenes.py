@@ -20,6 +20,8 @@ from tensor_stereo.datasets import PairFiles, find_pairs, read_disparity_png, re
 from tensor_stereo.datasets.synthetic.rendering import render_scene
 from tensor_stereo.features import to_gray
 
+Gray = NDArray[np.uint8]
+
 NUM_SYNTHETIC = 80
 _DOMAINS = {
     "middlebury-2001": "middlebury",
@@ -43,8 +45,8 @@ NUM_FOLDS = len(FOLDS)
 class Views(NamedTuple):
     """Grey images (H, W) uint8 and disparities (H, W) float32 px, NaN where unknown; None if not published."""
 
-    image0: NDArray[np.uint8]
-    image1: NDArray[np.uint8]
+    image0: Gray
+    image1: Gray
     disparity0: NDArray[np.float32]
     disparity1: NDArray[np.float32] | None
 

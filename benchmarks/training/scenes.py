@@ -55,9 +55,10 @@ class Scene(NamedTuple):
     """Where a scene comes from."""
 
     name: str
-    domain: str  # middlebury, eth3d, kitti, rendered or synthetic
+    domain: str  # middlebury, eth3d, kitti, rendered, synthetic or views
     fold: int | None  # that leaves it out; None: it is always in training
-    source: PairFiles | tuple[Path, Path, Path] | int  # files of a reader; left, right and truth; number of a rendering
+    source: PairFiles | tuple[Path, Path, Path] | int | Path  # files of a reader; left, right and truth; number of a
+    # rendering; folder of two views that are not rectified, which `view_scenes.py` lists and reads
 
     @property
     def least_error_px(self) -> float:
@@ -118,11 +119,11 @@ def _rendered(root: Path) -> list[tuple[str, str, None, tuple[Path, Path, Path]]
     return found
 
 
-def _render(number: int) -> Views:
-    rng = np.random.default_rng([77, number])
+def draw_synthetic_config(rng: np.random.Generator) -> SyntheticConfig:
+    """Random size and difficulty of a rendering."""
     width = int(rng.choice([400, 450, 520, 640, 800]))
     nearest = float(rng.uniform(2, 14))
-    config = SyntheticConfig(
+    return SyntheticConfig(
         width_px=width,
         height_px=int(width * rng.uniform(0.7, 0.85)),
         min_disparity_px=nearest,
@@ -131,7 +132,10 @@ def _render(number: int) -> Views:
         gain=float(rng.uniform(0.85, 1.15)),
         offset_levels=float(rng.uniform(-8, 8)),
     )
-    scene = render_scene((77, number), config)
+
+
+def _render(number: int) -> Views:
+    scene = render_scene((77, number), draw_synthetic_config(np.random.default_rng([77, number])))
     return Views(
         scene.image0[0].numpy(), scene.image1[0].numpy(), scene.disparity0.numpy(), scene.disparity1.numpy()
     )  # fmt: skip

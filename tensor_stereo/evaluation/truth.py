@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tensor_stereo.sampling import sample_nearest
 from tensor_stereo.scores.alignment import fit_alignment
-from tensor_stereo.types import Matches, check_points, check_rows, check_vector
+from tensor_stereo.types import Matches, check_points, check_vector
 
 _ALIGNING_PX = 2.0  # largest error of the disparity of matches that tell how the rows of a pair agree
 
@@ -86,15 +86,18 @@ def errors_to_partners(matches: Matches, partners_gt: Tensor, scale_gt: Tensor |
         tensor([0.0000, 2.5000], dtype=torch.float64)
     """
     check_points("partners_gt", partners_gt)
-    check_rows("partners_gt", partners_gt, matches.num_matches)
+    if len(partners_gt) != matches.num_matches:
+        raise ValueError(f"partners_gt must have one row per match ({matches.num_matches}), got {len(partners_gt)}")
     distance = (matches.keypoints1.detach().double() - partners_gt.detach().double()).norm(dim=1)
     known = partners_gt.isfinite().all(1)
     if scale_gt is not None:
         check_vector("scale_gt", scale_gt, matches.num_matches)
         if not scale_gt.is_floating_point():
             raise TypeError(f"scale_gt must be floating point with NaN for unknown, got {scale_gt.dtype}")
-        if bool((scale_gt <= 0).any()) or bool(scale_gt.isinf().any()):
-            raise ValueError("scale_gt must be positive and finite, or NaN where it is unknown")
+        bad = (scale_gt <= 0) | scale_gt.isinf()
+        if bool(bad.any()):
+            value = float(scale_gt[bad][0])
+            raise ValueError(f"scale_gt must be positive and finite, or NaN where it is unknown, got {value}")
         distance, known = distance / scale_gt.detach().double(), known & scale_gt.isfinite()
     finite = matches.keypoints0.isfinite().all(1) & matches.keypoints1.isfinite().all(1)
     return torch.where(known, distance.where(finite, torch.inf), torch.nan)

@@ -52,13 +52,16 @@ class Views(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Where a scene comes from."""
+    """Where a scene comes from.
+
+    ``source`` holds the files of a reader; the paths of left view, right view and truth; the number of a rendering; or
+    the folder of two views that are not rectified, which ``view_scenes.py`` lists and reads.
+    """
 
     name: str
     domain: str  # middlebury, eth3d, kitti, rendered, synthetic or views
     fold: int | None  # that leaves it out; None: it is always in training
-    source: PairFiles | tuple[Path, Path, Path] | int | Path  # files of a reader; left, right and truth; number of a
-    # rendering; folder of two views that are not rectified, which `view_scenes.py` lists and reads
+    source: PairFiles | tuple[Path, Path, Path] | int | Path
 
     @property
     def least_error_px(self) -> float:

@@ -258,12 +258,14 @@ def test_an_unknown_partner_has_no_error(unknown: float) -> None:
 def test_a_keypoint_that_is_no_number_is_wrong_but_not_where_the_partner_is_unknown(bad: float) -> None:
     matches, partners = random_matches(7)
     left, right = matches.keypoints0.clone(), matches.keypoints1.clone()
-    left[1, 0] = right[2, 1] = right[3, 0] = bad
+    left[1, 0] = right[2, 1] = right[3, 0] = right[4, 0] = bad
     partners[3, 1] = math.nan
-    found = errors_to_partners(Matches(left, right, matches.ptr), partners)
+    scale = torch.ones(50)
+    scale[4] = math.nan
+    found = errors_to_partners(Matches(left, right, matches.ptr), partners, scale)
     assert found[1:3].tolist() == [math.inf, math.inf]
-    assert found[3].isnan()
-    assert int(found.isfinite().sum()) == 47
+    assert found[3:5].isnan().all()
+    assert int(found.isfinite().sum()) == 46
 
 
 def test_errors_to_partners_of_no_match() -> None:

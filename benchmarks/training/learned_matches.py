@@ -21,7 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packa
 from shared.learned_matchers import match_learned
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.types import Matches
-from training.putatives import MIN_MATCHES, Putatives, alter_views, judge_matches
+from training.alterations import alter
+from training.putatives import MIN_MATCHES, Putatives, judge_matches
 from training.scenes import Scene, Views, list_scenes, read_views
 from training.work_folder import putatives_path
 
@@ -45,7 +46,7 @@ def _list_views(scene: Scene, number: int) -> Iterator[Views]:
     if scene.domain in REAL:
         rng, altered = np.random.default_rng([6, number]), views
         while np.array_equal(altered.image1, views.image1):  # sometimes nothing is altered
-            altered = alter_views(views, rng)
+            altered = alter(views, rng)
         if np.isfinite(altered.disparity0).any():
             yield altered
 

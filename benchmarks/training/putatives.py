@@ -7,6 +7,7 @@ scene in the list.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,7 +29,8 @@ from tensor_stereo.evaluation.truth import errors_against_gt
 from tensor_stereo.features import detect_features
 from tensor_stereo.pipeline import Stopwatch, match_pairs
 from tensor_stereo.types import Matches
-from training.scenes import Scene, Views, read_views
+from training.alterations import alter
+from training.scenes import Gray, Scene, Views, read_views
 
 VARIANTS = {"middlebury": 30, "eth3d": 30, "kitti": 8, "rendered": 12, "synthetic": 4}
 MAX_MATCHES, MIN_MATCHES = 1800, 30
@@ -70,22 +72,22 @@ def find_putatives(scene: Scene, number: int) -> list[Putatives]:
         for matching in (MatchingConfig(), GATES):
             config = replace(FIXED, detector=detector, matching=matching)
             kind = f"{detector}{' g' if matching is GATES else ''}"
-            found.append(judge_matches(scene, kind, True, views, _match(views, config)))
+            found.append(judge_matches(scene, kind, True, views, match(*views[:2], config)))
     for variant in range(VARIANTS[scene.domain]):
         rng = np.random.default_rng([5, number, variant])
-        altered = alter_views(views, rng)
+        altered = alter(views, rng)
         if not np.isfinite(altered.disparity0).any():
             continue
         largest_px = float(np.nanmax(altered.disparity0))
-        config, backend, gated = _draw_config(rng, largest_px)
+        config, backend, gated = draw_config(rng, largest_px)
         is_moved = rng.random() < MOVED
         if is_moved:
             altered, farthest_px = _move_rows(altered, rng)
             rows = config.matching.max_row_offset_px
             if rows is not None:
                 config = replace(config, matching=replace(config.matching, max_row_offset_px=rows + farthest_px))
-        matches = _sample_map(altered, config, largest_px) if backend == "sgbm" else _match(altered, config)
-        matches = _disturb(matches, altered, rng, gated)
+        matches = _sample_map(altered, config, largest_px) if backend == "sgbm" else match(*altered[:2], config)
+        matches = disturb(matches, altered.image1.shape, rng, largest_px if gated else None)
         if matches.num_matches < MIN_MATCHES:
             continue
         kind = f"{config.detector}-{backend}{' g' if gated else ''}{' moved' if is_moved else ''}"
@@ -98,40 +100,6 @@ def judge_matches(scene: Scene, kind: str, fixed: bool, views: Views, matches: M
     error_px = errors_against_gt(matches, [torch.from_numpy(views.disparity0.copy())])
     images = tuple(torch.from_numpy(x.copy())[None] for x in views[:2])
     return Putatives(scene.name, scene.domain, kind, fixed, scene.least_error_px, matches, images, error_px)
-
-
-def alter_views(views: Views, rng: np.random.Generator) -> Views:
-    """Mirror, turn over, resize, crop, and change noise, blur and exposure, each with some probability."""
-    image0, image1, disparity0, disparity1 = views
-    if disparity1 is not None and rng.random() < 0.4:  # mirrored views change places
-        image0, image1, disparity0 = image1[:, ::-1], image0[:, ::-1], disparity1[:, ::-1]
-    if rng.random() < 0.4:
-        image0, image1, disparity0 = image0[::-1], image1[::-1], disparity0[::-1]
-    image0, image1, disparity0 = (np.ascontiguousarray(x) for x in (image0, image1, disparity0))
-    height, width = image0.shape
-    if rng.random() < 0.4:
-        scale = min(float(np.exp(rng.uniform(np.log(0.7), np.log(2.0)))), max(1000 / width, 0.7))
-        size = round(width * scale), round(height * scale)
-        how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-        image0, image1 = (cv2.resize(x, size, interpolation=how) for x in (image0, image1))
-        disparity0 = cv2.resize(disparity0, size, interpolation=cv2.INTER_NEAREST) * np.float32(size[0] / width)
-        width, height = size
-    if rng.random() < 0.3:
-        rows, columns = int(height * rng.uniform(0.5, 1)), int(width * rng.uniform(0.6, 1))
-        y, x = rng.integers(0, height - rows + 1), rng.integers(0, width - columns + 1)
-        image0, image1, disparity0 = (a[y : y + rows, x : x + columns] for a in (image0, image1, disparity0))
-    if rng.random() < 0.5:
-        levels = [x.astype(np.float32) for x in (image0, image1)]
-        if rng.random() < 0.3:
-            blur_px = rng.uniform(0.3, 1.0)
-            levels = [cv2.GaussianBlur(x, (0, 0), blur_px) for x in levels]
-        if rng.random() < 0.2:  # the response of another sensor
-            levels[1] = 255 * (levels[1] / 255) ** np.exp(rng.normal(0, 0.1))
-        levels[1] = np.exp(rng.normal(0, 0.08)) * levels[1] + rng.normal(0, 5)
-        noise = rng.uniform(0, 4) if rng.random() < 0.6 else 0
-        noisy = [x + noise * rng.normal(0, 1, x.shape) for x in levels]
-        image0, image1 = (np.clip(np.rint(x), 0, 255).astype(np.uint8) for x in noisy)
-    return Views(image0, image1, disparity0, None)
 
 
 def _move_rows(views: Views, rng: np.random.Generator) -> tuple[Views, float]:
@@ -147,10 +115,16 @@ def _move_rows(views: Views, rng: np.random.Generator) -> tuple[Views, float]:
     return views._replace(image1=moved), float(np.abs(y - before).max())
 
 
-def _draw_config(rng: np.random.Generator, largest_px: float) -> tuple[PipelineConfig, str, bool]:
-    detector, backend, _ = SETTINGS[rng.choice(len(SETTINGS), p=[share for *_, share in SETTINGS])]
+def draw_config(
+    rng: np.random.Generator, largest_px: float | None, settings: Sequence[tuple[Detector, str, float]] = SETTINGS
+) -> tuple[PipelineConfig, str, bool]:
+    """Random settings of detector and matcher; implementation or matcher; whether rows and disparities are gated.
+
+    Gates let disparities up to ``largest_px`` through; None: there are none, as for views that are not rectified.
+    """
+    detector, backend, _ = settings[rng.choice(len(settings), p=[share for *_, share in settings])]
     count, window = int(rng.choice([500, 1000, 1500, 2000])), int(rng.choice([7, 9, 11, 11, 15]))
-    gated = bool(rng.random() < 0.5)
+    gated = bool(rng.random() < 0.5) and largest_px is not None
     matching = MatchingConfig(mutual=bool(rng.random() < 0.2))
     if gated:
         farthest = float(max(largest_px + 2, rng.choice([64, 128, 128, 192, 256])))
@@ -177,8 +151,9 @@ def _draw_config(rng: np.random.Generator, largest_px: float) -> tuple[PipelineC
     return config, backend, gated
 
 
-def _match(views: Views, config: PipelineConfig) -> Matches:
-    images = tuple(torch.from_numpy(x.copy())[None, None] for x in views[:2])
+def match(image0: Gray, image1: Gray, config: PipelineConfig) -> Matches:
+    """Putative matches of two grey images (H, W), of any sizes; float64 keypoints."""
+    images = tuple(torch.from_numpy(x.copy())[None, None] for x in (image0, image1))
     found = match_pairs([images], config, Stopwatch())
     return replace(found, keypoints0=found.keypoints0.double(), keypoints1=found.keypoints1.double())
 
@@ -198,19 +173,25 @@ def _sample_map(views: Views, config: PipelineConfig, largest_px: float) -> Matc
     return Matches(points, right, torch.tensor([0, len(points)]))
 
 
-def _disturb(matches: Matches, views: Views, rng: np.random.Generator, gated: bool) -> Matches:
-    """Leave matches out, make some wrong, move the keypoints of view 1, each with some probability."""
+def disturb(
+    matches: Matches, size: tuple[int, ...], rng: np.random.Generator, largest_px: float | None = None
+) -> Matches:
+    """Leave matches out, make some wrong, move the keypoints of view 1, each with some probability.
+
+    ``size`` is (height, width) of view 1. Wrong partners come from other matches, or lie on the row of the keypoint of
+    view 0 at a disparity of at most ``largest_px`` unless that is None.
+    """
     left, right = matches.keypoints0.numpy(), matches.keypoints1.numpy()
     cost = np.zeros(len(left)) if matches.cost is None else matches.cost.numpy()
-    height, width = views.image0.shape
+    height, width = size
     if rng.random() < 0.25:
         kept = rng.random(len(left)) < rng.uniform(0.2, 1)
         left, right, cost = left[kept], right[kept], cost[kept]
     if rng.random() < 0.2 and len(left) > 10:
         wrong = np.flatnonzero(rng.random(len(left)) < rng.uniform(0.05, 0.5))
         right = right.copy()
-        if gated and rng.random() < 0.5:
-            shift = rng.uniform(0, np.nanmax(views.disparity0), len(wrong))
+        if largest_px is not None and rng.random() < 0.5:
+            shift = rng.uniform(0, largest_px, len(wrong))
             right[wrong] = np.stack([left[wrong, 0] - shift, right[wrong, 1]], 1)
         else:
             right[wrong] = right[rng.permutation(wrong)]

@@ -20,6 +20,8 @@ from tensor_stereo.datasets import PairFiles, find_pairs, read_disparity_png, re
 from tensor_stereo.datasets.synthetic.rendering import render_scene
 from tensor_stereo.features import to_gray
 
+Gray = NDArray[np.uint8]
+
 NUM_SYNTHETIC = 80
 _DOMAINS = {
     "middlebury-2001": "middlebury",
@@ -43,19 +45,23 @@ NUM_FOLDS = len(FOLDS)
 class Views(NamedTuple):
     """Grey images (H, W) uint8 and disparities (H, W) float32 px, NaN where unknown; None if not published."""
 
-    image0: NDArray[np.uint8]
-    image1: NDArray[np.uint8]
+    image0: Gray
+    image1: Gray
     disparity0: NDArray[np.float32]
     disparity1: NDArray[np.float32] | None
 
 
 class Scene(NamedTuple):
-    """Where a scene comes from."""
+    """Where a scene comes from.
+
+    ``source`` holds the files of a reader; the paths of left view, right view and truth; the number of a rendering; or
+    the folder of two views that are not rectified, which ``view_scenes.py`` lists and reads.
+    """
 
     name: str
-    domain: str  # middlebury, eth3d, kitti, rendered or synthetic
+    domain: str  # middlebury, eth3d, kitti, rendered, synthetic or views
     fold: int | None  # that leaves it out; None: it is always in training
-    source: PairFiles | tuple[Path, Path, Path] | int  # files of a reader; left, right and truth; number of a rendering
+    source: PairFiles | tuple[Path, Path, Path] | int | Path
 
     @property
     def least_error_px(self) -> float:
@@ -116,11 +122,11 @@ def _rendered(root: Path) -> list[tuple[str, str, None, tuple[Path, Path, Path]]
     return found
 
 
-def _render(number: int) -> Views:
-    rng = np.random.default_rng([77, number])
+def draw_synthetic_config(rng: np.random.Generator) -> SyntheticConfig:
+    """Random size and difficulty of a rendering."""
     width = int(rng.choice([400, 450, 520, 640, 800]))
     nearest = float(rng.uniform(2, 14))
-    config = SyntheticConfig(
+    return SyntheticConfig(
         width_px=width,
         height_px=int(width * rng.uniform(0.7, 0.85)),
         min_disparity_px=nearest,
@@ -129,7 +135,10 @@ def _render(number: int) -> Views:
         gain=float(rng.uniform(0.85, 1.15)),
         offset_levels=float(rng.uniform(-8, 8)),
     )
-    scene = render_scene((77, number), config)
+
+
+def _render(number: int) -> Views:
+    scene = render_scene((77, number), draw_synthetic_config(np.random.default_rng([77, number])))
     return Views(
         scene.image0[0].numpy(), scene.image1[0].numpy(), scene.disparity0.numpy(), scene.disparity1.numpy()
     )  # fmt: skip

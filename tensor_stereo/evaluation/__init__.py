@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tensor_stereo.evaluation.trials import Trial as Trial
     from tensor_stereo.evaluation.trials import TrialRunner as TrialRunner
     from tensor_stereo.evaluation.truth import errors_against_gt as errors_against_gt
+    from tensor_stereo.evaluation.truth import errors_to_partners as errors_to_partners
     from tensor_stereo.evaluation.truth import matches_against_gt as matches_against_gt
 
 __getattr__, __dir__, __all__ = attach(
@@ -39,6 +40,7 @@ __getattr__, __dir__, __all__ = attach(
         "TrialRunner": "trials",
         "add_noise": "perturbation",
         "errors_against_gt": "truth",
+        "errors_to_partners": "truth",
         "evaluate_dataset": "dataset",
         "evaluate_pair": "dataset",
         "inject_outliers": "perturbation",

@@ -1,4 +1,7 @@
-"""Correct matches: disparity and row agree with ground truth, but for what all rows of a pair share."""
+"""Correct matches: disparity and row agree with ground truth, but for what all rows of a pair share.
+
+Of views that are not rectified, the distance to the true partner counts.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import pytest
 import torch
 
 from tensor_stereo.batching import collate_matches
-from tensor_stereo.evaluation.truth import matches_against_gt
+from tensor_stereo.evaluation.truth import errors_against_gt, errors_to_partners, matches_against_gt
 from tensor_stereo.types import Matches
 
 
@@ -180,3 +183,114 @@ def test_a_batch_is_the_loop_over_its_pairs() -> None:
     batch, _ = matches_against_gt(collate_matches(given), torch.cat([truth for _, truth in pairs]))
     alone = [matches_against_gt(m, truth)[0] for m, (_, truth) in zip(given, pairs, strict=True)]
     assert torch.equal(batch, torch.cat(alone))
+
+
+def random_matches(seed: int, count: int = 50) -> tuple[Matches, torch.Tensor]:
+    """Matches of two pairs whose keypoints have nothing to do with each other; partners that are not theirs either."""
+    rng = torch.Generator().manual_seed(seed)
+    left, right, partners = (torch.rand(count, 2, generator=rng, dtype=torch.float64) * 400 for _ in range(3))
+    return Matches(left, right, torch.tensor([0, count // 3, count])), partners
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_match_with_its_partner_has_no_error(dtype: torch.dtype) -> None:
+    matches, _ = random_matches(0)
+    matches = replace(matches, keypoints0=matches.keypoints0.to(dtype), keypoints1=matches.keypoints1.to(dtype))
+    error = errors_to_partners(matches, matches.keypoints1)
+    assert error.dtype == torch.float64
+    assert torch.equal(error, torch.zeros(50, dtype=torch.float64))
+
+
+def test_error_is_the_distance_to_the_partner() -> None:
+    matches, partners = random_matches(1)
+    expected = [math.dist(a, b) for a, b in zip(matches.keypoints1.tolist(), partners.tolist(), strict=True)]
+    torch.testing.assert_close(errors_to_partners(matches, partners), torch.tensor(expected, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("scale", [0.25, 1.0, 3.0])
+def test_where_view_1_is_larger_more_of_its_pixels_are_allowed(scale: float) -> None:
+    matches, partners = random_matches(2)
+    larger = replace(matches, keypoints1=scale * matches.keypoints1)
+    found = errors_to_partners(larger, scale * partners, torch.full((50,), scale))
+    torch.testing.assert_close(found, errors_to_partners(matches, partners))
+
+
+def test_each_match_has_the_scale_of_its_own_place() -> None:
+    matches, partners = random_matches(3)
+    scale = torch.linspace(0.5, 2, 50, dtype=torch.float64)
+    expected = errors_to_partners(matches, partners) / scale
+    torch.testing.assert_close(errors_to_partners(matches, partners, scale), expected)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 90.0, 180.0])
+def test_turning_and_moving_view_1_changes_no_error(degrees: float) -> None:
+    matches, partners = random_matches(4)
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    turn, shift = torch.tensor([[c, -s], [s, c]], dtype=torch.float64), torch.tensor([7.0, -300.0], dtype=torch.float64)
+    turned = replace(matches, keypoints1=matches.keypoints1 @ turn.T + shift)
+    expected = errors_to_partners(matches, partners)
+    torch.testing.assert_close(errors_to_partners(turned, partners @ turn.T + shift), expected)
+
+
+def test_errors_to_partners_of_a_rectified_pair_are_at_least_those_of_disparity_and_row() -> None:
+    matches, truth = rectified_pair(5)
+    x, y = matches.keypoints0.long().unbind(1)
+    partners = matches.keypoints0 - torch.stack([truth[0, y, x], torch.zeros(len(x))], 1)
+    larger = (matches.keypoints1 - partners).abs().amax(1)
+    found = errors_to_partners(matches, partners)
+    assert (found >= larger).all()
+    assert (found <= math.sqrt(2) * larger + 1e-12).all()
+    assert (found - errors_against_gt(matches, truth)).abs()[found < 1].max() < 0.5  # which takes shared rows out
+
+
+@pytest.mark.parametrize("unknown", [math.nan, math.inf, -math.inf])
+def test_an_unknown_partner_has_no_error(unknown: float) -> None:
+    matches, partners = random_matches(6)
+    partners[3, 0] = partners[4, 1] = unknown
+    found = errors_to_partners(matches, partners)
+    assert found.isnan().nonzero()[:, 0].tolist() == [3, 4]
+    scale = torch.ones(50)
+    scale[7] = math.nan
+    assert errors_to_partners(matches, partners, scale).isnan().nonzero()[:, 0].tolist() == [3, 4, 7]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_keypoint_that_is_no_number_is_wrong_but_not_where_the_partner_is_unknown(bad: float) -> None:
+    matches, partners = random_matches(7)
+    left, right = matches.keypoints0.clone(), matches.keypoints1.clone()
+    left[1, 0] = right[2, 1] = right[3, 0] = right[4, 0] = bad
+    partners[3, 1] = math.nan
+    scale = torch.ones(50)
+    scale[4] = math.nan
+    found = errors_to_partners(Matches(left, right, matches.ptr), partners, scale)
+    assert found[1:3].tolist() == [math.inf, math.inf]
+    assert found[3:5].isnan().all()
+    assert int(found.isfinite().sum()) == 46
+
+
+def test_errors_to_partners_of_no_match() -> None:
+    nothing = Matches(torch.zeros(0, 2), torch.zeros(0, 2), torch.tensor([0, 0]))
+    assert errors_to_partners(nothing, torch.zeros(0, 2), torch.zeros(0)).shape == (0,)
+
+
+def test_errors_to_partners_has_no_gradient() -> None:
+    matches, partners = random_matches(8)
+    matches = replace(matches, keypoints1=matches.keypoints1.requires_grad_())
+    assert not errors_to_partners(matches, partners.requires_grad_(), torch.ones(50, requires_grad=True)).requires_grad
+
+
+def test_errors_to_partners_names_what_is_wrong() -> None:
+    matches, partners = random_matches(9)
+    with pytest.raises(ValueError, match=r"partners_gt must have shape \(N, 2\)"):
+        errors_to_partners(matches, partners[:, 0])
+    with pytest.raises(ValueError, match="partners_gt must have one row per match"):
+        errors_to_partners(matches, partners[1:])
+    with pytest.raises(TypeError, match="partners_gt"):
+        errors_to_partners(matches, partners.long())
+    with pytest.raises(ValueError, match="scale_gt must have shape"):
+        errors_to_partners(matches, partners, torch.ones(50, 1))
+    with pytest.raises(TypeError, match="scale_gt"):
+        errors_to_partners(matches, partners, torch.ones(50, dtype=torch.int64))
+    for bad in (0.0, -1.0, math.inf):
+        with pytest.raises(ValueError, match="scale_gt must be positive"):
+            errors_to_partners(matches, partners, torch.full((50,), bad))

@@ -208,7 +208,7 @@ def test_weights_of_learned_are_parameters_that_survive_and_can_be_trained() -> 
 
 def test_repr_shows_the_settings() -> None:
     text = repr(ts.DelaunayFilter(min_precision=0.9))
-    assert "verdict='score', score='learned', min_precision=0.9, max_error_px=1.0, min_group_size=4" in text
+    assert "verdict='score', score='learned', min_precision=0.9, max_error_px=1.0, rectified=True" in text
     text = repr(ts.DelaunayFilter(verdict="adjacency", temperature=0.5))
     assert "verdict='adjacency', score='topology'" in text
     assert "temperature=0.5" in text

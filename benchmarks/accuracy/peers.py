@@ -59,6 +59,30 @@ def score_magsac(given: Putatives) -> Float:
     return np.ones(len(given.points0)) if inlier is None else inlier.ravel().astype(float)
 
 
+def score_residuals(given: Putatives, model: str) -> Float:
+    """Minus the distance in px from a model by MAGSAC++, OpenCV's, with its inliers as above.
+
+    That is Sampson's distance for a ``fundamental`` matrix, and the larger distance of both views for a ``homography``.
+    """
+    options = cv2.USAC_MAGSAC, MAGSAC_ERROR_PX, MAGSAC_CONFIDENCE, MAGSAC_ITERATIONS
+    find = cv2.findFundamentalMat if model == "fundamental" else _find_homography
+    matrix, _ = find(given.points0, given.points1, *options)
+    if matrix is None:
+        return np.zeros(len(given.points0))
+    left, right = (np.concatenate([points, np.ones((len(points), 1))], 1) for points in (given.points0, given.points1))
+    if model == "fundamental":
+        ahead, back = left @ matrix.T, right @ matrix
+        gradient = (ahead[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
+        return -np.abs((right * ahead).sum(1)) / np.sqrt(gradient.clip(1e-12))
+    shown, back = left @ matrix.T, right @ np.linalg.inv(matrix).T
+    misses = [x[:, :2] / x[:, 2:] - y[:, :2] for x, y in ((shown, right), (back, left))]
+    return -np.nan_to_num(np.max([np.linalg.norm(miss, axis=1) for miss in misses], 0), nan=1e9, posinf=1e9)
+
+
+def _find_homography(points0: Float, points1: Float, method: int, error_px: float, confidence: float, rounds: int):
+    return cv2.findHomography(points0, points1, method, error_px, None, rounds, confidence)
+
+
 def score_lpm(given: Putatives) -> Float:
     """Locality preserving matching (Ma et al., IJCV 127, 2019): minus its cost, multi-scale, two rounds."""
     motion = given.points1 - given.points0

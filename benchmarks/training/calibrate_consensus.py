@@ -2,10 +2,10 @@
 
     python benchmarks/training/calibrate_consensus.py WORK
 
-Prints slope and bias of each tolerance for rectified and other pairs, fitted with and without costs together, and the
-expected calibration error of each domain and kind of matches. ``tensor_stereo/scores/calibration.py`` holds them
-rounded. Only real scenes are used, because rendered ones have another share of correct matches; row offsets are taken
-out as the score takes them out.
+Prints slope and bias of each tolerance for rectified pairs, for any two views with epipolar lines, and without, fitted
+with and without costs together, and the expected calibration error of each domain and kind of matches.
+``tensor_stereo/scores/calibration.py`` holds them rounded. Only real scenes are used, because rendered ones have
+another share of correct matches; what all matches share is taken out as the score takes it out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.classification import classify_graphs
-from tensor_stereo.configs import UNRECTIFIED, FilterConfig
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import consensus_belief
 from tensor_stereo.scores.alignment import estimate_alignment
@@ -35,12 +34,17 @@ from training.work_folder import load_putatives
 EPS = 1e-4  # beliefs are cut to EPS..1 - EPS before their log-odds are taken
 
 
-def believe(given: Putatives, config: FilterConfig, *, has_cost: bool) -> tuple[Tensor, Tensor]:
+def believe(given: Putatives, title: str, *, has_cost: bool) -> tuple[Tensor, Tensor]:
     """(K,) log-odds of the tested matches whose truth is known, and their errors in px."""
     matches = given.matches if has_cost else replace(given.matches, cost=None)
     graphs = build_match_graphs(matches)
     known = given.error_px.isfinite() & (classify_graphs(graphs).relation != 0)
-    belief = consensus_belief(matches, graphs, config, estimate_alignment(matches, graphs))
+    alignment = estimate_alignment(matches, graphs, rectified=title == "rectified")
+    if title == "without lines":
+        alignment = alignment._replace(lines=torch.zeros_like(alignment.lines))
+    elif not alignment.has_rows.all():
+        known = torch.zeros_like(known)
+    belief = consensus_belief(matches, graphs, alignment=alignment)
     return torch.logit(belief[known].double(), eps=EPS), given.error_px[known]
 
 
@@ -48,10 +52,12 @@ def main() -> None:
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    putatives = load_putatives(parser.parse_args().work)
-    for title, config in (("rectified", FilterConfig()), ("not rectified", FilterConfig(consensus=UNRECTIFIED))):
+    work = parser.parse_args().work
+    rectified, of_views = (load_putatives(work / kind) for kind in ("rectified", "views"))
+    of_views += [replace(one, domain="rectified") for one in rectified if one.fixed]
+    for title, putatives in (("rectified", rectified), ("with lines", of_views), ("without lines", of_views)):
         found = [
-            (one, *believe(one, config, has_cost=has_cost))
+            (one, *believe(one, title, has_cost=has_cost))
             for one in putatives
             for has_cost in ((True, False) if one.matches.cost is not None else (False,))
         ]

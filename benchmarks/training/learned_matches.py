@@ -2,8 +2,8 @@
 
     python benchmarks/training/learned_matches.py DATA TRAINING_DATA WORK
 
-DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper are never read. WORK receives one file
-of putatives for each scene, in the form of ``train_learned.py``; scenes that have one are left out.
+DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper are never read. WORK/aliked receives one
+file of putatives for each scene, in the form of ``train_learned.py``; scenes that have one are left out.
 """
 
 from __future__ import annotations
@@ -61,13 +61,14 @@ def main() -> None:
     for name in ("data", "training_data", "work"):
         parser.add_argument(name, type=Path)
     options = parser.parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
+    folder = options.work / KIND
+    folder.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     num_synthetic = 0
     for number, scene in enumerate(list_scenes(options.data, options.training_data)):
         num_synthetic += scene.domain == "synthetic"
-        path = putatives_path(options.work, scene.name)
+        path = putatives_path(folder, scene.name)
         if num_synthetic > NUM_SYNTHETIC or path.exists():
             continue
         found = find_learned_matches(scene, number)

@@ -1,10 +1,14 @@
-"""Train the learned score, cross-validate it over scenes and drives, calibrate it, write its weights.
+"""Train a network of the learned score, cross-validate it over scenes and drives, calibrate it, write its weights.
 
-    python benchmarks/training/train_learned.py DATA TRAINING_DATA WORK weights.safetensors
+    python benchmarks/training/train_learned.py rectified DATA TRAINING_DATA WORK weights_rectified.safetensors
+    python benchmarks/training/learned_matches.py DATA TRAINING_DATA WORK
+    python benchmarks/training/train_learned.py views DATA TRAINING_DATA WORK weights_views.safetensors
 
-DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read. WORK
-receives the putatives of every scene and what the network sees of them (3 GB), and the weights and the figures of the
-cross-validation. Everything follows from the seeds below; each training runs on one thread.
+DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read.
+WORK/rectified and WORK/views receive the putatives of every scene and what the network sees of them (3 GB each), and
+the weights and the figures of the cross-validation. The network of any two views also learns from rectified pairs, seen
+as if nobody had said so, and from the matches that ``learned_matches.py`` leaves in WORK/aliked. Everything follows
+from the seeds below; each training runs on one thread.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -37,15 +42,21 @@ from tensor_stereo.scores.tolerance import TOLERANCES_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.calibration_error import calibration_error
+from training.learned_matches import KIND as ALIKED
 from training.platt_scaling import fit_calibration
 from training.putatives import Putatives, find_putatives
 from training.scenes import NUM_FOLDS, Scene, list_scenes
+from training.two_views import find_two_views
+from training.view_scenes import list_view_scenes
 from training.work_folder import fold_weights, items_path, putatives_path
 
 SEED, EPOCHS, PAIRS_AT_ONCE = 0, 30, 8
 LEARNING_RATE, WEIGHT_DECAY = 8e-3, 5e-2
 DROP_IMAGE, DROP_COST = 0.15, 0.30  # share of the pairs that are shown without
 BELIEF_WEIGHT = 0.2  # of the loss on the beliefs between rounds
+NUM_ALTERED = 4  # altered rectified putatives of a scene that the network of any two views sees
+RECTIFIED, VIEWS = "rectified", "views"  # the two networks, and the folders of their putatives
+_FINDERS = {RECTIFIED: find_putatives, VIEWS: find_two_views}
 _TOLERANCES = torch.tensor(TOLERANCES_PX)
 _ONE, _TWO = TOLERANCES_PX.index(1), TOLERANCES_PX.index(2)
 
@@ -61,25 +72,37 @@ class Item(NamedTuple):
     correct: Tensor  # (M, 5) bool
 
 
-def record_scene(work: Path, scene: Scene, number: int) -> None:
+def record_scene(kind: str, work: Path, scene: Scene, number: int) -> None:
     """Write the putatives of a scene, unless they are there."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    path = putatives_path(work, scene.name)
+    path = putatives_path(work / kind, scene.name)
     if not path.exists():
-        torch.save(find_putatives(scene, number), path)
+        torch.save(_FINDERS[kind](scene, number), path)
 
 
-def measure_scene(work: Path, scene: Scene) -> None:
+def measure_scene(kind: str, work: Path, scene: Scene) -> None:
     """Write what the network sees of the putatives of a scene."""
     torch.set_num_threads(1)
-    found = torch.load(putatives_path(work, scene.name), weights_only=False)
-    torch.save([to_item(one) for one in found], items_path(work, scene.name))
+    found = _load_putatives(work / kind, scene)
+    if kind == VIEWS:
+        others = _load_putatives(work / RECTIFIED, scene)
+        altered = [one for one in others if not one.fixed]
+        others = [one for one in others if one.fixed] + altered[:NUM_ALTERED] + _load_putatives(work / ALIKED, scene)
+        found += [replace(one, domain=RECTIFIED) for one in others]
+    items = [to_item(one, rectified=kind == RECTIFIED) for one in found]
+    torch.save(items, items_path(work / kind, scene.name))
 
 
-def to_item(given: Putatives) -> Item:
+def _load_putatives(folder: Path, scene: Scene) -> list[Putatives]:
+    path = putatives_path(folder, scene.name)
+    found: list[Putatives] = torch.load(path, weights_only=False) if path.exists() else []
+    return found
+
+
+def to_item(given: Putatives, *, rectified: bool = True) -> Item:
     matches, graphs = given.matches, build_match_graphs(given.matches)
-    alignment = estimate_alignment(matches, graphs)
+    alignment = estimate_alignment(matches, graphs, rectified=rectified)
     evidence = measure_images(*([image] for image in given.images), matches, graphs, alignment)
     quantities = measure_quantities(matches, graphs, evidence, alignment=alignment)
     error = given.error_px[:, None]
@@ -154,7 +177,7 @@ def loss_of(network: LearnedScore, q: Quantities, known: Tensor, correct: Tensor
     loss = _cross_entropy(logit, correct, weight[:, None] * known)
     target = torch.where(known[:, _ONE], correct[:, _ONE], correct[:, _TWO])
     for belief in beliefs[1:]:
-        loss = loss + BELIEF_WEIGHT * _cross_entropy(belief, target, weight * judged)
+        loss = loss + BELIEF_WEIGHT * _cross_entropy(belief, target, weight * known[:, _TWO])
     return loss
 
 
@@ -238,29 +261,35 @@ def report(found: Sequence[LeftOut], calibration: Tensor) -> dict[str, dict[str,
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=_FINDERS)
     for name in ("data", "training_data", "work", "out"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
+    folder = options.work / options.kind
+    folder.mkdir(parents=True, exist_ok=True)
     scenes = list_scenes(options.data, options.training_data)
+    if options.kind == VIEWS:
+        if missing := [name for name in (RECTIFIED, ALIKED) if not (options.work / name).is_dir()]:
+            parser.error(f"work must hold the putatives of {' and '.join(missing)}, got {options.work}")
+        scenes += list_view_scenes(options.training_data)
     numbers = range(len(scenes))
     with multiprocessing.get_context("spawn").Pool(options.processes) as pool:
         start = time.perf_counter()
-        pool.starmap(partial(record_scene, options.work), zip(scenes, numbers, strict=True), chunksize=1)
+        pool.starmap(partial(record_scene, options.kind, options.work), zip(scenes, numbers, strict=True), chunksize=1)
         print(f"putatives of {len(scenes)} scenes: {time.perf_counter() - start:.0f} s", flush=True)
         start = time.perf_counter()
-        pool.map(partial(measure_scene, options.work), scenes, chunksize=1)
+        pool.map(partial(measure_scene, options.kind, options.work), scenes, chunksize=1)
         print(f"evidence: {time.perf_counter() - start:.0f} s", flush=True)
-        run = partial(cross_validate, options.work, scenes)
+        run = partial(cross_validate, folder, scenes)
         (whole, _), *folds = pool.map(run, [None, *range(NUM_FOLDS)], chunksize=1)
     left_out = [one for _, found in folds for one in found]
     calibration = calibrate(left_out)
-    for path, weights in zip([options.out, *fold_weights(options.work)], [whole, *(w for w, _ in folds)], strict=True):
+    for path, weights in zip([options.out, *fold_weights(folder)], [whole, *(w for w, _ in folds)], strict=True):
         weights["calibration"] = calibration
         save_file({name: values.contiguous() for name, values in weights.items()}, path)
     figures = {"calibration": calibration.tolist(), **report(left_out, calibration)}
-    (options.work / "figures.json").write_text(json.dumps(figures, indent=1))
+    (folder / "figures.json").write_text(json.dumps(figures, indent=1))
     print(json.dumps(figures, indent=1), f"{time.perf_counter() - start:.0f} s", sep="\n")
 
 

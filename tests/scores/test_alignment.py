@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from tensor_stereo import DelaunayFilter, Matches
 from tensor_stereo.batching import collate_matches
-from tensor_stereo.configs import UNRECTIFIED
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import measure_images
 from tensor_stereo.scores.alignment import Alignment, align_matches, estimate_alignment, fit_alignment
+from tensor_stereo.scores.alignment.form import no_alignment
 
 SIZE = torch.tensor([450.0, 370.0], dtype=torch.float64)
 
@@ -163,9 +163,7 @@ def test_the_order_of_the_matches_changes_nothing_but_rounding() -> None:
 
 def test_aligned_matches_lie_on_their_rows() -> None:
     matches = surface(4, 400, 0.0, (-7, 0.02, 0.01), noise_px=0.0)
-    known = Alignment(
-        torch.tensor([[-7, 0.02, 0.01, 0.0]], dtype=torch.float64), torch.tensor([True]), torch.tensor([400])
-    )
+    known = no_alignment(1, SIZE)._replace(coefficients=torch.tensor([[-7, 0.02, 0.01, 0.0]], dtype=torch.float64))
     aligned = align_matches(matches, known)
     torch.testing.assert_close(aligned.keypoints1[:, 1], matches.keypoints0[:, 1], rtol=0, atol=1e-9)
     assert torch.equal(aligned.keypoints1[:, 0], matches.keypoints1[:, 0])
@@ -204,7 +202,6 @@ def test_the_output_tells_what_was_taken_out() -> None:
     for run in (
         DelaunayFilter(verdict="cardinality", score="none"),
         DelaunayFilter(verdict="cardinality"),
-        DelaunayFilter(score="consensus", consensus=UNRECTIFIED),
     ):
         assert run(matches).alignment is None
 
@@ -232,14 +229,13 @@ def test_windows_are_compared_along_the_rows_of_the_alignment() -> None:
     ptr = torch.tensor([0, 60])
     lowered = torch.cat([pair.image1[:, :3], pair.image1[:, :-3]], 1)
     straight, lower = Matches(left, right, ptr), Matches(left, right + torch.tensor([0.0, 3.0]), ptr)
-    fitted = torch.tensor([True])
     found = [
         measure_images(
             [pair.image0],
             [image],
             matches,
             build_match_graphs(matches),
-            Alignment(torch.tensor([[a, 0, 0, 0]]).double(), fitted, torch.tensor([60])),
+            no_alignment(1, SIZE)._replace(coefficients=torch.tensor([[a, 0, 0, 0]]).double()),
         )
         for image, matches, a in ((pair.image1, straight, 0.0), (lowered, lower, 3.0))
     ]

@@ -14,7 +14,6 @@ from scipy.special import expit, logit
 
 import tensor_stereo as ts
 from tensor_stereo.batching import collate_matches, split, split_matches
-from tensor_stereo.configs import UNRECTIFIED, FilterConfig
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import calibration
 from tensor_stereo.scores.calibration import calibrate_consensus, keep_by_target
@@ -80,8 +79,8 @@ def test_a_calibrated_score_reaches_its_target() -> None:
 
 def test_calibration_is_a_logistic_regression_and_keeps_the_order() -> None:
     score = torch.linspace(0, 1, 10_001, dtype=torch.float64)
-    for rectified in (True, False):
-        found = calibrate_consensus(score, rectified=rectified)[:, 1].numpy()
+    for kind in (0, 1, 2):
+        found = calibrate_consensus(score, torch.full(score.shape, kind))[:, 1].numpy()
         low, middle = found[[2000, 5000]]
         slope = (logit(middle) - logit(low)) / (logit(0.5) - logit(0.2))
         expected = expit(slope * logit(np.clip(score.numpy(), 1e-4, 1 - 1e-4)) + logit(middle))
@@ -89,16 +88,20 @@ def test_calibration_is_a_logistic_regression_and_keeps_the_order() -> None:
         assert (np.diff(found[1:-1]) > 0).all()
 
 
-@given(st.integers(1, 70), st.booleans())
-def test_a_probability_does_not_depend_on_the_length_of_its_vector(length: int, rectified: bool) -> None:
-    belief = torch.rand(70, generator=torch.Generator().manual_seed(length), dtype=torch.float64)
-    whole = calibrate_consensus(belief, rectified=rectified)
-    assert torch.equal(calibrate_consensus(belief[:length], rectified=rectified), whole[:length])
+@given(st.integers(1, 70), st.sampled_from([0, 1, 2, None]))
+def test_a_probability_does_not_depend_on_the_length_of_its_vector(length: int, kind: int | None) -> None:
+    generator = torch.Generator().manual_seed(length)
+    belief = torch.rand(70, generator=generator, dtype=torch.float64)
+    kinds = torch.randint(0, 3, (70,), generator=generator) if kind is None else torch.full((70,), kind)
+    whole = calibrate_consensus(belief, kinds)
+    assert torch.equal(calibrate_consensus(belief[:length], kinds[:length]), whole[:length])
+    for k in range(3):  # each kind as if it were alone
+        assert torch.equal(calibrate_consensus(belief, torch.full((70,), k))[kinds == k], whole[kinds == k])
 
 
 def test_every_tolerance_has_its_own_regression_and_none_falls(monkeypatch: pytest.MonkeyPatch) -> None:
     table = ((0.9, -0.5), (0.7, 1.0), (0.6, 1.5), (0.5, 1.0), (0.4, 3.0))  # that of 3 px crosses that of 2 px
-    monkeypatch.setattr(calibration, "_CONSENSUS", {True: table, False: table})
+    monkeypatch.setattr(calibration, "_CONSENSUS", (table,) * 3)
     belief = torch.linspace(1e-4, 1 - 1e-4, 501, dtype=torch.float64)
     found = calibrate_consensus(belief)
     assert found.shape == (501, 5)
@@ -112,7 +115,7 @@ def test_calibration_has_the_slope_of_a_logistic_regression() -> None:
     belief = torch.tensor([1e-5, 1e-3, 0.2, 0.5, 0.9], dtype=torch.float64, requires_grad=True)
     probability = calibrate_consensus(belief)[:, 1]
     (slope,) = torch.autograd.grad(probability.sum(), belief)
-    (at_one_px, _) = calibration._CONSENSUS[True][1]
+    (at_one_px, _) = calibration._CONSENSUS[0][1]
     expected = at_one_px * probability * (1 - probability) / (belief * (1 - belief))  # in log-odds a straight line
     assert slope[0] == 0  # saturated
     torch.testing.assert_close(slope[1:], expected[1:].detach(), rtol=0.01, atol=0)
@@ -148,10 +151,13 @@ def test_more_is_asked_fewer_are_kept(wanted: str) -> None:
 
 def test_pairs_that_are_not_rectified_have_a_calibration_of_their_own() -> None:
     matches = random_pair("float", 5, 300)
-    output = ts.DelaunayFilter(consensus=UNRECTIFIED, min_precision=0.9)(matches)
+    output = ts.DelaunayFilter(score="consensus", rectified=False, min_precision=0.9)(matches)
     tested = output.relation != 0
-    belief = consensus_belief(matches, build_match_graphs(matches), FilterConfig(consensus=UNRECTIFIED))
-    probability = calibrate_consensus(belief, rectified=False)[:, 1].to(belief.dtype)
+    assert output.alignment is not None
+    assert not output.alignment.rectified.any()
+    belief = consensus_belief(matches, build_match_graphs(matches), alignment=output.alignment)
+    kind = torch.where(output.alignment.has_rows, 1, 2).repeat_interleave(matches.ptr.diff())
+    probability = calibrate_consensus(belief, kind)[:, 1].to(belief.dtype)
     assert torch.equal(output.score, torch.where(tested, probability, 0))
     assert torch.equal(output.inlier, keep_by_target(probability, tested, matches.ptr, min_precision=0.9))
 

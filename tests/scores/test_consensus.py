@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.autograd import forward_ad
 
-from tensor_stereo import UNRECTIFIED, ConsensusConfig, FilterConfig, Matches
+from tensor_stereo import ConsensusConfig, FilterConfig, Matches
 from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.scores.alignment.form import Alignment, no_alignment
 from tensor_stereo.scores.calibration import calibrate_consensus
 from tensor_stereo.scores.consensus import consensus_belief, consensus_probabilities, consensus_score
 from tensor_stereo.scores.tolerance import probability_within
@@ -30,9 +31,9 @@ def _matches(seed: int, num_matches: int, *, whole: bool = False) -> Matches:
     return Matches(left, right, torch.tensor([0, num_matches // 3, num_matches]), cost)
 
 
-def _belief(matches: Matches, backend: str, **settings: float | None) -> torch.Tensor:
+def _belief(matches: Matches, backend: str, alignment: Alignment | None = None, **settings: float) -> torch.Tensor:
     config = FilterConfig(consensus=ConsensusConfig(**settings), backend=backend)  # type: ignore[arg-type]
-    return consensus_belief(matches, build_match_graphs(matches), config)
+    return consensus_belief(matches, build_match_graphs(matches), config, alignment)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -54,13 +55,13 @@ def test_order_shift_and_exchange_of_views_change_nothing(backend: str, seed: in
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("settings", [ConsensusConfig(slope=0.3), UNRECTIFIED])
+@pytest.mark.parametrize("settings", [ConsensusConfig(slope=0.3), ConsensusConfig(row_tolerance_px=2)])
 def test_the_score_is_the_calibrated_belief_of_its_own_settings(backend: str, settings: ConsensusConfig) -> None:
     matches, config = _matches(5, 60), FilterConfig(consensus=settings, backend=backend)  # type: ignore[arg-type]
     graphs = build_match_graphs(matches)
     belief, score = consensus_belief(matches, graphs, config), consensus_score(matches, graphs, config)
     cumulative = consensus_probabilities(matches, graphs, config)
-    assert torch.equal(cumulative, calibrate_consensus(belief, rectified=settings.rectified))
+    assert torch.equal(cumulative, calibrate_consensus(belief))
     assert torch.equal(score, cumulative[:, 1])
     wide = dataclasses.replace(config, max_error_px=2.5)
     assert torch.equal(consensus_score(matches, graphs, wide), probability_within(cumulative, 2.5))
@@ -68,13 +69,14 @@ def test_the_score_is_the_calibrated_belief_of_its_own_settings(backend: str, se
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_quarter_turn_changes_nothing_without_rectification(backend: str) -> None:
+def test_a_quarter_turn_changes_nothing_where_no_row_is_known(backend: str) -> None:
     matches = _matches(0, 90)
     turn = torch.tensor([-1.0, 1.0])
     turned = dataclasses.replace(
         matches, keypoints0=matches.keypoints0.flip(1) * turn, keypoints1=matches.keypoints1.flip(1) * turn
     )
-    found, expected = (_belief(m, backend, row_tolerance_px=None) for m in (turned, matches))
+    no_rows = no_alignment(matches.num_pairs, matches.keypoints0, rectified=False)
+    found, expected = (_belief(m, backend, no_rows) for m in (turned, matches))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 

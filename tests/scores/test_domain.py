@@ -27,9 +27,13 @@ def wrong_rows(rows: float, wrong: float = 0.3) -> ts.Matches:
 
 def turned(degrees: float) -> ts.Matches:
     left = scene(2, 200)[0]
+    return pair(turned_points(left, degrees), left)
+
+
+def turned_points(points: Tensor, degrees: float) -> Tensor:
     angle = math.radians(degrees)
     turn = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    return pair((left - 160) @ turn.T + 160, left)
+    return (points - 160) @ turn.T + 160
 
 
 def marks(matches: ts.Matches, **settings: object) -> list[str]:
@@ -66,7 +70,7 @@ def test_a_row_offset_is_taken_out_and_no_matter_for_a_warning(rows: float, scor
 def test_a_turned_view_gets_one_warning_that_says_what_to_set(degrees: float, score: str) -> None:
     found, (text,) = run(turned(degrees), score=score)
     assert found == [Domain.ROWS]
-    for words in ("rectified pairs", "of pair 0", "consensus=UNRECTIFIED", "'cardinality'"):
+    for words in ("rectified pairs", "of pair 0", "rectified=False", "'auto'"):
         assert words in text
 
 
@@ -101,7 +105,8 @@ def test_noise_of_either_sign_is_no_row_offset() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"consensus": ts.UNRECTIFIED},
+        {"rectified": False},
+        {"rectified": "auto"},
         {"verdict": "cardinality"},
         {"score": "topology", "threshold": 0.5},
         {"verdict": "adjacency", "score": "none"},
@@ -119,7 +124,7 @@ def test_few_matches_say_nothing_about_their_pair() -> None:
 
 def test_normalised_coordinates_are_marked_by_either_score() -> None:
     left, right = (points / 320 for points in scene(5, 200))
-    for settings in ({}, {"score": "consensus"}, {"consensus": ts.UNRECTIFIED}):
+    for settings in ({}, {"score": "consensus"}, {"rectified": False}):
         found, (text,) = run(pair(right, left), **settings)
         assert found == [Domain.SPAN]
         assert "multiply normalised coordinates by the size of the image" in text
@@ -167,9 +172,12 @@ def test_what_is_no_probability_has_no_domain(settings: dict[str, object]) -> No
     assert run(shuffled(), **settings) == (None, [])
 
 
-def test_pairs_that_are_not_rectified_are_marked_by_their_span_alone() -> None:
-    assert run(shuffled(), consensus=ts.UNRECTIFIED) == ([Domain(0)], [])
-    assert run(turned(20.0), consensus=ts.UNRECTIFIED) == ([Domain(0)], [])
+@pytest.mark.parametrize("rectified", [False, "auto"])
+def test_of_any_two_views_those_are_marked_that_have_nothing_in_common(rectified: object) -> None:
+    found, (text,) = run(shuffled(), rectified=rectified)
+    assert found == [Domain.AGREEMENT]
+    assert "hardly do" in text
+    assert run(turned(20.0), rectified=rectified) == ([Domain(0)], [])
 
 
 def test_a_pair_may_have_several_reasons() -> None:

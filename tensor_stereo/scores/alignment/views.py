@@ -242,7 +242,7 @@ def fit_lines(points: Normalized) -> tuple[Tensor, Tensor]:
     for scale_px, prior in rounds:
         ridge = prior * (scale_px / points.size).square()[:, None] * parallel
         moments = _moments([weight * column for column in products], products, pairs) + torch.diag_embed(ridge)
-        lines = torch.linalg.eigh(moments).eigenvectors[:, :, 0]
+        lines = _least_eigenvector(moments)
         f = [pairs.spread(lines[:, k]) for k in range(9)]
         ahead = [f[k] * left[0] + f[k + 1] * left[1] + f[k + 2] * left[2] for k in (0, 3, 6)]
         back = [f[k] * right[0] + f[k + 3] * right[1] + f[k + 6] * right[2] for k in (0, 1)]
@@ -252,6 +252,15 @@ def fit_lines(points: Normalized) -> tuple[Tensor, Tensor]:
         weight = _say(off_px / scale_px) / gradient
     fundamental = points.to_normal.transpose(1, 2) @ lines.reshape(-1, 3, 3) @ points.to_normal
     return fundamental, off_px
+
+
+def _least_eigenvector(moments: Tensor) -> Tensor:
+    """(B, 9) that of the least eigenvalue of positive semidefinite matrices (B, 9, 9)."""
+    # The last bits depend on where a matrix lies in memory: of 16 x 16 numbers, all lie alike.
+    trace = moments.diagonal(dim1=1, dim2=2).sum(1)
+    beyond = functional.pad(moments.new_zeros(9), (0, 7), value=1.0) * (1 + 2 * trace[:, None])
+    whole = functional.pad(moments, (0, 7, 0, 7)) + torch.diag_embed(beyond)
+    return torch.linalg.eigh(whole).eigenvectors[:, :9, 0]
 
 
 def _agreeing(

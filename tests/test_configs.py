@@ -162,7 +162,6 @@ def test_a_contradiction_says_what_to_set(settings: dict[str, Any], words: str) 
 
 def test_auto_stands_for_the_best_score_that_is_asked_for() -> None:
     assert FilterConfig().resolved_score == "learned"
-    assert FilterConfig(consensus=ts.UNRECTIFIED).resolved_score == "consensus"
     for restriction in RESTRICTIONS:
         assert FilterConfig(verdict=restriction).resolved_score == "none"
         assert ts.DelaunayFilter(verdict=restriction).config.resolved_score == "topology"
@@ -180,32 +179,38 @@ def test_old_names_fail_with_the_new_one() -> None:
         _ = configs.Nothing
 
 
-def test_files_of_any_two_views_look_at_no_rows_unless_they_are_told_to() -> None:
-    loose = configs.FileFilterConfig()
-    assert loose.resolve(rectified=True) == FilterConfig()
-    of_any_views = loose.resolve(rectified=False)
-    assert (of_any_views.verdict, of_any_views.score) == ("cardinality", "consensus")
-    assert of_any_views.consensus == ts.UNRECTIFIED
-    by_score = configs.FileFilterConfig(verdict="score").resolve(rectified=False)
-    assert (by_score.resolved_score, by_score.consensus) == ("consensus", ts.UNRECTIFIED)
-    assert configs.FileFilterConfig(verdict="adjacency").resolve(rectified=False).resolved_score == "none"
-    told = ts.ConsensusConfig(row_tolerance_px=5.0)
-    assert configs.FileFilterConfig(consensus=told).resolve(rectified=False).consensus == told
+def test_files_differ_in_one_default_alone() -> None:
+    loose, default = vars(configs.FileFilterConfig()), vars(FilterConfig())
+    assert loose == default | {"rectified": "auto"}
+    assert default["rectified"] is True
+    for kind in (PipelineConfig, TrialConfig, EvaluationConfig):
+        assert kind().rectified is True
 
 
-def test_settings_for_files_are_not_those_of_the_module() -> None:
-    for config in (configs.FileFilterConfig(), "cardinality", {"verdict": "cardinality"}):
+@pytest.mark.parametrize("value", [1, 0, 1.0, "yes", "True", "AUTO", None, np.True_, np.array([True]), ("auto",)])
+@pytest.mark.parametrize("kind", [FilterConfig, configs.FileFilterConfig, PipelineConfig, EvaluationConfig])
+def test_rectified_is_a_boolean_or_auto(kind: type, value: object) -> None:
+    for known in (True, False, "auto"):
+        assert kind(rectified=known).rectified is known
+    with pytest.raises((ValueError, TypeError), match="^rectified must be one of True, False, auto, got"):
+        kind(rectified=value)
+    with pytest.raises((ValueError, TypeError), match="^rectified must be one of True, False, auto, got"):
+        ts.DelaunayFilter(rectified=value)
+
+
+def test_settings_of_another_kind_are_not_those_of_the_module() -> None:
+    for config in ("cardinality", {"verdict": "cardinality"}):
         with pytest.raises(TypeError, match="config must be a FilterConfig"):
             ts.DelaunayFilter(config)  # type: ignore[arg-type]
+    assert ts.DelaunayFilter(configs.FileFilterConfig()).config.rectified == "auto"
     with pytest.raises(ValueError, match="min_precision must be None beside threshold"):
         configs.FileFilterConfig(threshold=0.3, min_precision=0.9)
 
 
-def test_any_two_views_keep_the_settings_of_the_consensus() -> None:
-    config = configs.FileFilterConfig(score="consensus", consensus=ts.ConsensusConfig(slope=0.3, row_tolerance_px=None))
-    resolved = config.resolve(rectified=False)
-    assert resolved.consensus.slope == 0.3
-    assert resolved.consensus.row_tolerance_px is None
+@pytest.mark.parametrize("name", ["row_tolerance_px", "whole_row_tolerance_px"])
+def test_consensus_always_looks_at_rows(name: str) -> None:
+    with pytest.raises(TypeError, match=rf"ConsensusConfig\.{name} must be a number, got None"):
+        ts.ConsensusConfig(**{name: None})
 
 
 @pytest.mark.parametrize("detectors", [(), ("fast", "fast")])

@@ -28,7 +28,7 @@ class Demo:
 
 @dataclass(frozen=True)
 class Classify:
-    """Match one rectified pair and decide which matches are right."""
+    """Match the images of one pair and decide which matches are right."""
 
     left: tyro.conf.Positional[Path]
     """Image of view 0."""

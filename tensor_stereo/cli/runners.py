@@ -100,7 +100,7 @@ def _run_filter(command: Filter) -> int:
     settings = {name: getattr(command, name) for name in ("keypoints", "score_name", "config")}
     if is_many(command.matches, command.out):
         return _filter_many(command, settings)
-    return _print_counts(filter_file(command.matches, command.out, **settings))
+    return _print_counts(filter_file(command.matches, command.out, **settings), command)
 
 
 def _filter_many(command: Filter, settings: dict[str, Any]) -> int:
@@ -116,7 +116,7 @@ def _filter_many(command: Filter, settings: dict[str, Any]) -> int:
         )
     print(f"{'num_files':20}{summary.num_files:8}")
     print(f"{'num_found':20}{summary.num_found:8}")
-    code = _print_counts(summary.matches)
+    code = _print_counts(summary.matches, command)
     for name, reason in summary.errors.items():
         fail(f"{name}: {reason}")
     if summary.errors:
@@ -124,9 +124,11 @@ def _filter_many(command: Filter, settings: dict[str, Any]) -> int:
     return code
 
 
-def _print_counts(summary: FilterSummary) -> int:
+def _print_counts(summary: FilterSummary, command: Filter) -> int:
     values = asdict(summary)
     num_agreeing = values.pop("num_agreeing")
+    if not command.config.is_probability:
+        del values["num_rectified"]
     for name, value in values.items():
         print(f"{name:20}{value:8}")
     return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)
@@ -187,12 +189,14 @@ def _run_classify(command: Classify) -> int:
     )
     values = asdict(summary)
     rates = values.pop("rates") or {}
-    num_agreeing, domain = values.pop("num_agreeing"), values.pop("domain")
+    num_agreeing, domain, rectified = (values.pop(name) for name in ("num_agreeing", "domain", "rectified"))
     kept_by = {f"kept_by_{name}": count for name, count in values.pop("kept_by").items()}
     for name, value in (values | kept_by | rates).items():
         print(f"{name:20}{value:8.2f}" if isinstance(value, float) else f"{name:20}{value:8}")
     if domain is not None:
         print(f"{'domain':20}{domain or 'inside':>8}")
+    if rectified is not None and command.config.rectified == "auto":
+        print(f"{'rectified':20}{'yes' if rectified else 'no':>8}")
     if summary.rates is not None and summary.rates.fraction_incorrect != summary.rates.fraction_incorrect:
         return fail(f"no match has known ground truth in {command.disparity_gt}, so there are no rates")
     return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)
@@ -203,8 +207,8 @@ def _check_kept(num_kept: int, num_matches: int, num_agreeing: int) -> int:
     if num_kept or 2 * num_agreeing <= num_matches:
         return OK
     return fail(
-        f"no match is kept, although {num_agreeing} of {num_matches} agree with their neighbours; are the pairs "
-        "rectified, the coordinates pixels, the target in reach? --verdict cardinality asks for neither"
+        f"no match is kept, although {num_agreeing} of {num_matches} agree with their neighbours; does --rectified "
+        "fit, are the coordinates pixels, is the target in reach? --verdict cardinality asks for none of it"
     )
 
 

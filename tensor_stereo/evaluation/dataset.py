@@ -37,6 +37,7 @@ ROW_SCHEMA: dict[str, Any] = {
     "noise_px": pl.Float64,
     "seed": pl.Int64,
     "score": pl.String,  # the one that was computed, or none
+    "rectified": pl.String,  # true, false or auto; null where the score does not ask
     "temperature": pl.Float64,  # of the score topology, else null
     "temperature_unit": pl.String,
     **{  # of the score consensus, else null
@@ -65,6 +66,7 @@ ROW_SCHEMA: dict[str, Any] = {
     "score_counts_correct": pl.List(pl.Int64),  # 128 equal bins of [0, 1]; they add up over pairs
     "score_counts_incorrect": pl.List(pl.Int64),
     "domain": pl.String,  # why the score may be far off, empty if it may not; null where it is no probability
+    "is_rectified": pl.Boolean,  # what the score took the pair for; null where it does not ask
     "seconds": pl.Struct(dict.fromkeys(STAGES, pl.Float64)),  # wall time by stage, also where it was shared
 }
 

@@ -44,6 +44,7 @@ class Trial:
         score: (M,), higher is better; None if the setting asks for none.
         domain: Why the pair lies outside of what the probability was calibrated on, a value of
             :class:`tensor_stereo.scores.Domain`, 0 inside; None where there is no probability.
+        is_rectified: Whether the score took the pair for a rectified one; None where it does not ask.
         seconds: wall time of each of ``STAGES``, also where it was shared with other trials.
     """
 
@@ -56,6 +57,7 @@ class Trial:
     classification: Classification
     score: Tensor | None
     domain: int | None
+    is_rectified: bool | None
     seconds: dict[str, float]
 
     def row(self) -> dict[str, Any]:
@@ -83,6 +85,7 @@ class Trial:
             "recall": rates.recall,
             **self._score_row(),
             "domain": None if self.domain is None else describe_domain(self.domain),
+            "is_rectified": self.is_rectified,
             "seconds": self.seconds,
         }
 
@@ -109,6 +112,8 @@ def setting_columns(config: TrialConfig) -> dict[str, Any]:
 
     >>> setting_columns(TrialConfig(detector="sift"))["max_ratio"]
     0.8
+    >>> [setting_columns(TrialConfig(rectified=kind))["rectified"] for kind in (True, False, "auto")]
+    ['true', 'false', 'auto']
     """
     features, score = getattr(config, config.detector), config.resolved_score
     return {
@@ -128,6 +133,7 @@ def setting_columns(config: TrialConfig) -> dict[str, Any]:
         "noise_px": config.noise_px,
         "seed": config.seed,
         "score": score,
+        "rectified": str(config.rectified).lower() if config.is_probability else None,
         "temperature": config.temperature if score == "topology" else None,
         "temperature_unit": config.temperature_unit if score == "topology" else None,
         **{
@@ -160,7 +166,8 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
     keys["relate"] = keys["graph"], trial.verdict == "adjacency", trial.min_group_size
     used = {
         "topology": (trial.temperature, trial.temperature_unit),
-        "consensus": trial.consensus,
+        "consensus": (trial.consensus, trial.rectified),
+        "learned": trial.rectified,
     }
     keys["score"] = keys["graph"], trial.resolved_score, used.get(trial.resolved_score)
     return keys
@@ -229,14 +236,16 @@ class TrialRunner:
             "relate",
             lambda: classify_graphs(graphs, trial),
         )
-        score = domain = found = None
+        score = domain = is_rectified = found = None
         if trial.resolved_score != "none":
             found = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
         if found is not None:
             score = found.within(trial.max_error_px).to(found.score.dtype)  # it may be that of another tolerance
             verdict, score = apply_score(verdict, score, matches.ptr, trial)
             domain = None if found.domain is None else int(found.domain)
-        return Trial(self.pair, trial, matches, correct, valid, graphs, verdict, score, domain, seconds)
+            is_rectified = None if found.alignment is None else bool(found.alignment.rectified)
+        known = graphs, verdict, score, domain, is_rectified, seconds
+        return Trial(self.pair, trial, matches, correct, valid, *known)
 
     def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor]:
         """The matches as the setting wants them, and how far they are from ground truth, NaN where it is unknown."""

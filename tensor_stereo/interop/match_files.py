@@ -12,7 +12,7 @@ from tensor_stereo.interop.formats import check_files
 from tensor_stereo.interop.hdf5_matches import filter_hdf5
 from tensor_stereo.interop.match_tables import filter_table
 from tensor_stereo.interop.npz import filter_npz
-from tensor_stereo.interop.verdicts import FilterSummary
+from tensor_stereo.interop.verdicts import FilterSummary, MatchFilter, RectifiedCount
 from tensor_stereo.modules import DelaunayFilter
 
 
@@ -75,12 +75,19 @@ def filter_file(
     config = FileFilterConfig() if config is None else config
     if config.resolved_score == "none":
         config = replace(config, score="none")  # nobody asks for a gradient here
-    run = DelaunayFilter(config)
+    run = RectifiedCount(DelaunayFilter(config))
     with whole_file(out) as target:
-        if ending == ".npz":
-            return filter_npz(source, target, run, score_name=score_name)
-        if ending == ".db":
-            return filter_colmap(source, target, run)
-        if ending == ".h5":
-            return filter_hdf5(source, target, run, keypoints)
-        return filter_table(source, target, run, score_name=score_name)
+        summary = _filter(ending, source, target, run, keypoints, score_name)
+    return replace(summary, num_rectified=run.num_rectified)
+
+
+def _filter(
+    ending: str, source: Path, target: Path, run: MatchFilter, keypoints: Path | None, score_name: str | None
+) -> FilterSummary:
+    if ending == ".npz":
+        return filter_npz(source, target, run, score_name=score_name)
+    if ending == ".db":
+        return filter_colmap(source, target, run)
+    if ending == ".h5":
+        return filter_hdf5(source, target, run, keypoints)
+    return filter_table(source, target, run, score_name=score_name)

@@ -3,7 +3,7 @@
 ======================================================  ===============================================================
 arrays                                                  written by
 ======================================================  ===============================================================
-``keypoints0``, ``keypoints1`` (M, 2); ``ptr``,         this library, one or many rectified pairs; without ``ptr`` one
+``keypoints0``, ``keypoints1`` (M, 2); ``ptr``,         this library, one or many pairs; without ``ptr`` one
 ``cost``, ``group``
 ``keypoints0``, ``keypoints1``, ``matches0`` (N0,)      LightGlue, glue-factory, SuperGlue (``match_pairs.py``)
 or ``matches1`` (N1,)

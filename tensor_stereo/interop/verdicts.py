@@ -36,6 +36,7 @@ class FilterSummary:
     num_rejected: int = 0
     num_untested: int = 0
     num_agreeing: int = 0  # whose neighbours in one view contain those in the other
+    num_rectified: int = 0  # pairs that the score took for rectified; 0 where it does not ask
 
     def add(self, num_pairs: int, verdicts: Verdicts) -> FilterSummary:
         """The counts with those of ``num_pairs`` more pairs."""
@@ -47,6 +48,28 @@ class FilterSummary:
 
     def __add__(self, other: FilterSummary) -> FilterSummary:
         return FilterSummary(*(mine + more for mine, more in zip(astuple(self), astuple(other), strict=True)))
+
+
+class RectifiedCount:
+    """A filter that counts the pairs that it takes for rectified.
+
+    >>> from tensor_stereo import DelaunayFilter
+    >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
+    >>> count = RectifiedCount(DelaunayFilter(rectified="auto"))
+    >>> _ = count(Matches(left, left - torch.tensor([2.0, 0.0]), torch.tensor([0, 50])))
+    >>> count.num_rectified
+    1
+    """
+
+    def __init__(self, run: MatchFilter) -> None:
+        self.num_rectified = 0
+        self._run = run
+
+    def __call__(self, matches: Matches) -> FilterOutput:
+        output = self._run(matches)
+        if output.alignment is not None:
+            self.num_rectified += int(output.alignment.rectified.sum())
+        return output
 
 
 class Verdicts(NamedTuple):

@@ -42,6 +42,7 @@ class MatchSummary:
         kept_by: What each verdict keeps: ``adjacency``, ``cardinality``, and ``score`` if there is one that can decide.
         rates: Of the verdict of the settings against ground truth, or None.
         domain: Why the pair lies outside of what the probability was calibrated on, empty inside; None without one.
+        rectified: Whether the score took the pair for a rectified one; None where it does not ask.
     """
 
     num_matches: int
@@ -52,6 +53,7 @@ class MatchSummary:
     kept_by: dict[str, int]
     rates: Rates | None = None
     domain: str | None = None
+    rectified: bool | None = None
 
 
 def classify_files(
@@ -65,7 +67,7 @@ def classify_files(
     out: Path | str | None = None,
     figure: Path | str | None = None,
 ) -> MatchSummary:
-    """Match two image files of a rectified pair and decide which matches are right.
+    """Match two image files and decide which matches are right; the pair is rectified unless the settings say otherwise.
 
     Args:
         left: Image of view 0.
@@ -123,6 +125,7 @@ def classify_files(
         kept_by={name: int(kept.sum()) for name, kept in _verdicts(output, config).items()},
         rates=None if truth is None else match_rates(verdict.inlier, *truth),
         domain=None if output.domain is None else describe_domain(int(output.domain)),
+        rectified=_is_rectified(output),
     )
 
 
@@ -171,6 +174,10 @@ def _verdicts(output: PipelineOutput, config: PipelineConfig) -> dict[str, Tenso
     return verdicts_by_name(output.classification, output.score, config)
 
 
+def _is_rectified(output: PipelineOutput) -> bool | None:
+    return None if output.alignment is None else bool(output.alignment.rectified)
+
+
 def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, truth: Truth | None) -> Figure:
     correct, valid = truth if truth is not None else (None, None)
     images = pair.image0, pair.image1
@@ -179,6 +186,9 @@ def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, trut
     if config.verdict == "score":
         shown["cardinality"] = verdicts["cardinality"]
     contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in images if config.constrained]
+    title = f"{pair.name}, {config.detector.upper()}"
+    if config.rectified == "auto" and output.alignment is not None:
+        title += ", taken for rectified" if _is_rectified(output) else ", taken for not rectified"
     return draw_classification(
         *images,
         output.matches,
@@ -190,5 +200,5 @@ def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, trut
         valid=valid,
         contours0=contours[0] if contours else None,
         contours1=contours[1] if contours else None,
-        title=f"{pair.name}, {config.detector.upper()}",
+        title=title,
     )

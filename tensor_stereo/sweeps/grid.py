@@ -153,6 +153,8 @@ def simplify(trial: TrialConfig) -> TrialConfig:
         unused |= {"temperature": _DEFAULT.temperature, "temperature_unit": _DEFAULT.temperature_unit}
     if trial.resolved_score != "consensus":
         unused["consensus"] = _DEFAULT.consensus
+    if not trial.is_probability:
+        unused["rectified"] = _DEFAULT.rectified
     if not trial.constrained:
         unused["objects"] = ObjectsConfig()
     return replace(trial, **unused)
@@ -185,7 +187,7 @@ def _convert(name: str, value: Any, hint: Any) -> Any:
             return None
         (hint,) = (part for part in get_args(hint) if part is not NoneType)
     if get_origin(hint) is Literal:
-        if value not in get_args(hint):
+        if not any(type(value) is type(one) and value == one for one in get_args(hint)):  # 1 is not True
             raise ValueError(f"{name} must be one of {', '.join(map(str, get_args(hint)))}, got {value!r}")
         return value
     if hint is float and type(value) is int:

@@ -176,7 +176,10 @@ def test_rows_name_the_settings_of_the_score_that_ran_and_leave_the_others_null(
           for name in vars(CONSENSUS.consensus)),
         (TOPOLOGY, {"consensus": ConsensusConfig(slope=0.5)}, None),
         (TrialConfig(), {"consensus": ConsensusConfig(slope=0.5)}, None),
-        (TrialConfig(), {"consensus": ConsensusConfig(row_tolerance_px=None)}, "score"),  # auto is consensus then
+        (TrialConfig(), {"rectified": False}, "score"),
+        (CONSENSUS, {"rectified": "auto"}, "score"),
+        (TOPOLOGY, {"rectified": "auto"}, None),
+        (PAPER, {"rectified": False}, None),
         (TrialConfig(), {"score": "learned"}, None),  # as auto is
         (TrialConfig(score="topology", threshold=0.4), {"threshold": 0.5}, None),
         (TrialConfig(), {"threshold": 0.5}, None),
@@ -291,3 +294,19 @@ def test_a_pair_outside_of_the_domain_says_so_in_its_row() -> None:
     trial = TrialConfig(outlier_rate=1.0)
     with pytest.warns(DomainWarning, match="those of pair 0 hardly do"):
         assert TrialRunner(PAIR).run(trial).row()["domain"] == "agreement"
+
+
+@pytest.mark.parametrize("rectified", [True, False, "auto"])
+def test_a_row_says_what_the_pair_was_taken_for(rectified: Any) -> None:
+    runner = TrialRunner(PAIR)
+    for score in ("learned", "consensus"):
+        trial = runner.run(TrialConfig(score=score, rectified=rectified))
+        row = trial.row()
+        assert row["rectified"] == str(rectified).lower()
+        assert row["is_rectified"] is trial.is_rectified is (rectified is not False)
+        output = run_pipeline([(PAIR.image0, PAIR.image1)], trial.config)
+        assert torch.equal(trial.score, output.score)
+        assert row["is_rectified"] == output.alignment.rectified.item()
+    for config in (PAPER, TOPOLOGY):
+        row = runner.run(replace(config, rectified=rectified)).row()
+        assert row["rectified"] is row["is_rectified"] is None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from tensor_stereo import UNRECTIFIED, DelaunayFilter, FilterConfig, Matches, classify_matches
+from tensor_stereo import DelaunayFilter, FilterConfig, Matches, classify_matches
 from tensor_stereo.batching import collate_matches
 from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.matchers import scene
@@ -46,5 +46,5 @@ def expected(matches: Matches, **settings: object) -> Verdicts:
 
 
 def expected_of_any_views(matches: Matches) -> Verdicts:
-    """The default of files whose pairs need not be rectified."""
-    return expected(matches, verdict="cardinality", score="consensus", consensus=UNRECTIFIED)
+    """The default of files and adapters, whose pairs need not be rectified."""
+    return expected(matches, rectified="auto")

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import warnings
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+import torch
 
-from tensor_stereo import UNRECTIFIED, DelaunayFilter, Matches
-from tensor_stereo.batching import ptr_to_batch, split_matches
+from tensor_stereo import DelaunayFilter, DomainWarning, Matches
+from tensor_stereo.batching import collate_matches, ptr_to_batch, split_matches
 from tensor_stereo.configs import FileFilterConfig, FilterConfig, PipelineConfig
 from tensor_stereo.interop.formats import FORMATS
 from tensor_stereo.interop.match_files import filter_file
@@ -98,8 +100,7 @@ def test_all_formats_get_the_verdicts_of_one_batch(tmp_path: Path, ending: str) 
     arguments = write_source(tmp_path, ending, matches)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     summary = filter_file(**arguments)
-    wanted = expected_of_any_views(matches) if ending in (".h5", ".db") else expected(matches)
-    assert_verdicts(arguments["out"], summary, wanted)
+    assert_verdicts(arguments["out"], summary, expected_of_any_views(matches))
     assert summary.num_pairs == (5 if ending in (".npz", ".h5", ".db") else 4)  # a table has no pairs without rows
     assert {path: path.read_bytes() for path in before} == before
     assert files(tmp_path) == sorted([*(path.name for path in before), f"out{ending}"])
@@ -111,55 +112,59 @@ def test_settings_reach_the_filter(tmp_path: Path, ending: str) -> None:
     matches = Matches(*(points.float().double() for points in (matches.keypoints0, matches.keypoints1)), matches.ptr)
     arguments = write_source(tmp_path, ending, matches)
     config = FilterConfig(**SET_TEST)  # type: ignore[arg-type]
-    of_any_views = ending in (".h5", ".db")
-    assert_verdicts(
-        arguments["out"],
-        filter_file(**arguments, config=config),
-        expected(matches, **SET_TEST),
-    )
+    assert_verdicts(arguments["out"], filter_file(**arguments, config=config), expected(matches, **SET_TEST))
     pipeline = PipelineConfig(verdict="adjacency")
     summary = filter_file(**arguments, config=pipeline)
     assert_verdicts(arguments["out"], summary, expected(matches, verdict="adjacency"))
-    views = {"consensus": UNRECTIFIED} if of_any_views else {}
     summary = filter_file(**arguments, config=FilterConfig(threshold=0.6))  # replaces what is there
-    assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.6, **views))
+    assert_verdicts(arguments["out"], summary, expected(matches, threshold=0.6))
     for settings in (
         {"score": "learned"},
         {"score": "topology", "temperature": 0.3, "threshold": 0.4},
         {"min_precision": 0.8, "score": "consensus"},
     ):
-        for config in (FilterConfig(**settings), FileFilterConfig(**settings, verdict="score")):  # type: ignore[arg-type]
+        for config in (FilterConfig(**settings), FileFilterConfig(**settings)):  # type: ignore[arg-type]
             filter_file(**arguments, config=config)
-            output = DelaunayFilter(**settings, **views)(matches)  # type: ignore[arg-type]
+            output = DelaunayFilter(**settings, rectified=config.rectified)(matches)  # type: ignore[arg-type]
             assert read_inliers(arguments["out"]) == output.inlier.tolist()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_the_form_of_a_file_chooses_the_verdict_that_is_left_open(tmp_path: Path, ending: str) -> None:
-    matches = batch(1, [60])
-    matches = Matches(*(points.float().double() for points in (matches.keypoints0, matches.keypoints1)), matches.ptr)
+@pytest.mark.parametrize("turn", [0.0, 30.0])
+def test_matches_of_every_format_tell_whether_their_pair_is_rectified(tmp_path: Path, ending: str, turn: float) -> None:
+    matches = turned(batch(1, [200]), turn)
     arguments = write_source(tmp_path, ending, matches)
-    of_any_views = ending in (".h5", ".db")
-    by_form = "cardinality" if of_any_views else "score"
-    for config in (None, FileFilterConfig(), FileFilterConfig(min_group_size=5)):
-        filter_file(**arguments, config=config)
-        verdict = DelaunayFilter(verdict=by_form, min_group_size=5 if config and config.min_group_size == 5 else 4)
-        assert read_inliers(arguments["out"]) == verdict(matches).inlier.tolist()
-    if of_any_views:
-        with pytest.raises(ValueError, match="min_precision needs the verdict 'score', got 'cardinality'"):
-            filter_file(**arguments, config=FileFilterConfig(min_precision=0.9))
-    filter_file(**arguments, config=FileFilterConfig(verdict="score", score="consensus"))
-    by_score = DelaunayFilter(score="consensus", **({"consensus": UNRECTIFIED} if of_any_views else {}))(matches)
-    assert read_inliers(arguments["out"]) == by_score.inlier.tolist()
+    for config in (None, FileFilterConfig(), FileFilterConfig(min_group_size=5), FilterConfig(rectified="auto")):
+        summary = filter_file(**arguments, config=config)
+        output = DelaunayFilter(rectified="auto", min_group_size=config.min_group_size if config else 4)(matches)
+        assert read_inliers(arguments["out"]) == output.inlier.tolist()
+        assert output.inlier.sum() > 80
+        assert summary.num_rectified == int(output.alignment.rectified) == (turn == 0)
+    for rectified in (True, False):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DomainWarning)
+            summary = filter_file(**arguments, config=FileFilterConfig(rectified=rectified))
+            output = DelaunayFilter(rectified=rectified)(matches)
+        assert read_inliers(arguments["out"]) == output.inlier.tolist()
+        assert summary.num_rectified == rectified
+    assert filter_file(**arguments, config=FileFilterConfig(verdict="cardinality")).num_rectified == 0
 
 
-def test_archives_with_partners_are_taken_for_pairs_of_any_two_views(tmp_path: Path) -> None:
-    matches = batch(1, [60])
-    source, out = tmp_path / "in.npz", tmp_path / "out.npz"
-    left, right = both(matches)
-    np.savez(source, keypoints0=left, keypoints1=right, matches0=np.arange(60))
-    filter_file(source, out)
-    assert read_inliers(out) == DelaunayFilter(verdict="cardinality")(matches).inlier.tolist()
+def turned(matches: Matches, degrees: float) -> Matches:
+    """The same with view 1 turned, in single precision as some formats store it."""
+    angle = np.deg2rad(degrees)
+    turn = torch.tensor([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]], dtype=torch.float64)
+    left, right = matches.keypoints0, matches.keypoints1 @ turn
+    return Matches(left.float().double(), right.float().double(), matches.ptr)
+
+
+def test_each_pair_of_a_file_is_taken_for_what_it_is(tmp_path: Path) -> None:
+    pairs = [turned(batch(seed, [200]), degrees) for seed, degrees in ((1, 0.0), (1, 30.0), (2, 0.0))]
+    matches = collate_matches(pairs)
+    arguments = write_source(tmp_path, ".npz", matches)
+    summary = filter_file(**arguments)
+    assert (summary.num_pairs, summary.num_rectified) == (3, 2)
+    assert read_inliers(arguments["out"]) == DelaunayFilter(rectified="auto")(matches).inlier.tolist()
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tensor_stereo import Matches, Relation, table_files
 from tensor_stereo.batching import ptr_to_batch, split_matches
-from tensor_stereo.configs import UNRECTIFIED, PipelineConfig
+from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
 from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.match_tables import filter_table
@@ -123,7 +123,7 @@ def test_other_columns_of_a_parquet_file_keep_their_types(tmp_path: Path) -> Non
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_what_classify_writes_is_read_back(tmp_path: Path, ending: str) -> None:
     pair = SyntheticDataset(1, seed=1)[0]
-    settings = {"verdict": "cardinality", "score": "consensus", "consensus": UNRECTIFIED}
+    settings = {"verdict": "cardinality", "score": "consensus", "rectified": "auto"}
     for config in (PipelineConfig(**settings), PipelineConfig(**settings, constrained=True)):  # type: ignore[arg-type]
         output = run_pipeline([(pair.image0, pair.image1)], config)
         table = match_table(output, config)

@@ -190,7 +190,7 @@ def test_the_pair_of_a_row_is_not_given_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_forms_of_other_tools_are_not_taken_for_rectified(tmp_path: Path, form: Any) -> None:
+def test_matches_of_every_form_tell_whether_their_pair_is_rectified(tmp_path: Path, form: Any) -> None:
     arrays, expected, places = form(4)
     np.savez(tmp_path / "in.npz", **arrays)
     filter_file(tmp_path / "in.npz", tmp_path / "out.npz", config=None)

@@ -80,11 +80,23 @@ def test_a_setting_of_consensus_is_an_axis_where_that_is_the_score() -> None:
     ]  # fmt: skip
 
 
-def test_pairs_that_are_not_rectified_turn_auto_into_consensus(tmp_path: Path) -> None:
-    config = _read(tmp_path, '[grid]\nconsensus.row_tolerance_px = [0.25, "none"]')
-    assert [(trial.score, trial.consensus.row_tolerance_px) for trial in config.trials] == [
-        ("learned", 0.25), ("consensus", None)
+def test_rectified_is_an_axis_where_a_score_asks_for_it(tmp_path: Path) -> None:
+    for text, expected in (("true", [True]), ("false", [False]), ('"auto"', ["auto"]), ('[true, "auto", false]', [True, "auto", False])):
+        config = _read(tmp_path, f"[grid]\nrectified = {text}")
+        assert [trial.rectified for trial in config.trials] == expected
+        assert all(trial.rectified is value for trial, value in zip(config.trials, expected, strict=True))
+    axis = {"rectified": [False, "auto"], "score": ["none", "topology", "consensus", "learned"]}
+    found = expand_grid([axis | {"verdict": "adjacency"}])
+    assert [(trial.score, trial.rectified) for trial in found] == [
+        ("none", True), ("topology", True), ("consensus", False), ("learned", False), ("consensus", "auto"),
+        ("learned", "auto"),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", ["1", "0", "1.0", '"True"', '"yes"', '"none"', "[]", "[true, [true]]"])
+def test_other_values_of_rectified_are_refused_by_name(tmp_path: Path, value: str) -> None:
+    with pytest.raises(ValueError, match=r"rectified must (be one of True, False, auto, got|have at least one value)"):
+        _read(tmp_path, f"[grid]\nrectified = {value}")
 
 
 def test_the_tolerance_is_an_axis_whatever_decides(tmp_path: Path) -> None:

@@ -18,10 +18,11 @@ from tensor_stereo.reports.sweep.results import COUNTS
 
 @dataclass(frozen=True)
 class Setting:
-    """How a column of settings is called, and what null means in it."""
+    """How a column of settings is called, what null means in it, and whether its words need the heading beside them."""
 
     heading: str
     none: str = "–"
+    needs_heading: bool = False
 
 
 SETTINGS = {
@@ -41,6 +42,7 @@ SETTINGS = {
     "noise_px": Setting("noise px"),
     "seed": Setting("seed"),
     "score": Setting("score"),
+    "rectified": Setting("rectified", needs_heading=True),
     "temperature": Setting("temperature"),
     "temperature_unit": Setting("unit"),
     **{f"consensus_{f.name}": Setting(f"consensus {f.name.replace('_', ' ')}") for f in fields(ConsensusConfig)},
@@ -88,11 +90,13 @@ def setting_text(name: str, value: Any) -> str:
 
     >>> setting_text("max_ratio", None), setting_text("mutual", True), setting_text("noise_px", 0.50)
     ('off', 'yes', '0.5')
+    >>> setting_text("rectified", "false"), setting_text("rectified", "auto")
+    ('no', 'auto')
     """
     if value is None:
         return SETTINGS[name].none
-    if isinstance(value, bool):
-        return "yes" if value else "no"
+    if isinstance(value, bool) or value in ("true", "false"):
+        return "yes" if value in (True, "true") else "no"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -104,6 +108,8 @@ def settings_label(row: Mapping[str, Any], names: Sequence[str]) -> str:
     >>> row = dict(verdict="cardinality", score="topology", temperature=0.5, temperature_unit=None, threshold=None)
     >>> settings_label(row, list(row))
     'cardinality, topology, temperature 0.5'
+    >>> settings_label({"score": "learned", "rectified": "auto"}, ["score", "rectified"])
+    'learned, rectified auto'
     """
     parts = []
     for name in names:
@@ -113,7 +119,8 @@ def settings_label(row: Mapping[str, Any], names: Sequence[str]) -> str:
         elif name == "score" and text == "none":
             parts.append("no score")
         elif text != Setting.none:
-            parts.append(text if isinstance(row[name], str) else f"{SETTINGS[name].heading} {text}")
+            is_word = isinstance(row[name], str) and not SETTINGS[name].needs_heading
+            parts.append(text if is_word else f"{SETTINGS[name].heading} {text}")
     return ", ".join(parts) or "all settings alike"
 
 

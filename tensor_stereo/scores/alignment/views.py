@@ -293,13 +293,12 @@ def _moments(rows: list[Tensor], columns: tuple[Tensor, ...] | list[Tensor], pai
 
 def _median(values: Tensor, pairs: PairSums) -> Tensor:
     """(B, C) lower medians of (K, C) values over the rows of each pair; 0 without."""
-    if not len(values):
-        return values.new_zeros(len(pairs.ptr) - 1, values.shape[1])
-    place = (pairs.ptr[:-1] + (pairs.ptr.diff() - 1).clamp(min=0) // 2).clamp(max=len(values) - 1)
+    batch = functional.pad(pairs.batch, (0, 1), value=len(pairs.ptr))  # one more, so that there is a row to point at
+    place = pairs.ptr[:-1] + (pairs.ptr.diff() - 1).clamp(min=0) // 2
     found = []
-    for column in values.unbind(1):
+    for column in functional.pad(values, (0, 0, 0, 1)).unbind(1):
         order = column.argsort(stable=True)
-        order = order.index_select(0, pairs.batch.index_select(0, order).argsort(stable=True))
+        order = order.index_select(0, batch.index_select(0, order).argsort(stable=True))
         found.append(column.index_select(0, order.index_select(0, place)))
     return torch.where((pairs.ptr.diff() > 0)[:, None], torch.stack(found, 1), 0)
 

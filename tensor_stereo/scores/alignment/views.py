@@ -8,6 +8,7 @@ neighbours do, and these name an affine map, then epipolar lines, then a homogra
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -189,9 +190,9 @@ def fit_affine(points: Normalized, scales_px: tuple[float, ...]) -> Tensor:
             miss = [t - sum(pairs.spread(fit[:, m, n]) * b for m, b in enumerate(basis)) for n, t in enumerate(targets)]
             weight = _say(torch.hypot(*miss) * pairs.spread(points.size) / scale_px)
         ridge = (scale_px / points.size / _LINEAR_PRIOR).square()
-        normal = _moments([weight * b for b in basis], basis, pairs)
+        normal = _gram(weight, basis, pairs)
         normal = normal + torch.diag_embed(torch.stack([ridge, ridge, torch.full_like(ridge, 1e-9)], 1))
-        fit = torch.linalg.solve(normal, _moments([weight * b for b in basis], targets, pairs))
+        fit = torch.linalg.solve(normal, _products([weight * b for b in basis], targets, pairs))
     affine = torch.eye(3, dtype=fit.dtype, device=fit.device).expand(len(fit), 3, 3).clone()
     affine[:, :2] += fit.transpose(1, 2)
     return points.from_normal @ affine @ points.to_normal
@@ -215,8 +216,8 @@ def fit_homography(points: Normalized, scales_px: tuple[float, ...]) -> tuple[Te
         for columns, t in zip(equations, (u - x, v - y), strict=True):
             scaled = [c / depth for c in columns]
             weighted = [weight * c for c in scaled]
-            normal = normal + _moments(weighted, scaled, pairs)
-            target = target + _moments(weighted, (t / depth,), pairs)
+            normal = normal + _gram(weight, scaled, pairs)
+            target = target + _products(weighted, (t / depth,), pairs)
         prior = x.new_tensor([_LINEAR_PRIOR, _LINEAR_PRIOR, 1e3] * 2 + [_PERSPECTIVE_PRIOR] * 2)
         noise = (scale_px / points.size).square()[:, None]
         fit = torch.linalg.solve(normal + torch.diag_embed(noise / prior.square()), target)[..., 0]
@@ -241,7 +242,7 @@ def fit_lines(points: Normalized) -> tuple[Tensor, Tensor]:
     rounds = [(scale, _AFFINE) for scale in _LINE_SCALES_PX] + [(scale, _FREE) for scale in _FREE_SCALES_PX]
     for scale_px, prior in rounds:
         ridge = prior * (scale_px / points.size).square()[:, None] * parallel
-        moments = _moments([weight * column for column in products], products, pairs) + torch.diag_embed(ridge)
+        moments = _gram(weight, products, pairs) + torch.diag_embed(ridge)
         lines = _least_eigenvector(moments)
         f = [pairs.spread(lines[:, k]) for k in range(9)]
         ahead = [f[k] * left[0] + f[k + 1] * left[1] + f[k + 2] * left[2] for k in (0, 3, 6)]
@@ -285,7 +286,16 @@ def _miss_px(homography: Tensor, points: Normalized) -> Tensor:
     return torch.hypot(*miss.unbind(1)) * points.pairs.spread(points.size)
 
 
-def _moments(rows: list[Tensor], columns: tuple[Tensor, ...] | list[Tensor], pairs: PairSums) -> Tensor:
+def _gram(weight: Tensor, columns: Sequence[Tensor], pairs: PairSums) -> Tensor:
+    """(B, C, C) weighted sums of products of the columns, symmetric, over the rows of each pair."""
+    size = len(columns)
+    weighted = [weight * column for column in columns]
+    upper = pairs.sum(torch.stack([weighted[k] * columns[m] for k in range(size) for m in range(k, size)], 1))
+    place = [min(k, m) * (2 * size - min(k, m) - 1) // 2 + max(k, m) for k in range(size) for m in range(size)]
+    return upper[:, place].reshape(-1, size, size)
+
+
+def _products(rows: Sequence[Tensor], columns: Sequence[Tensor], pairs: PairSums) -> Tensor:
     """(B, R, C) sums of products over the rows of each pair."""
     sums = pairs.sum(torch.stack([a * b for a in rows for b in columns], 1))
     return sums.reshape(-1, len(rows), len(columns))

@@ -192,9 +192,9 @@ def test_files_differ_in_one_default_alone() -> None:
 def test_rectified_is_a_boolean_or_auto(kind: type, value: object) -> None:
     for known in (True, False, "auto"):
         assert kind(rectified=known).rectified is known
-    with pytest.raises((ValueError, TypeError), match="^rectified must be one of True, False, auto, got"):
+    with pytest.raises((ValueError, TypeError), match=r"^rectified must be one of True, False, auto, got"):
         kind(rectified=value)
-    with pytest.raises((ValueError, TypeError), match="^rectified must be one of True, False, auto, got"):
+    with pytest.raises((ValueError, TypeError), match=r"^rectified must be one of True, False, auto, got"):
         ts.DelaunayFilter(rectified=value)
 
 

@@ -104,7 +104,7 @@ def find_form(place: str, headers: Mapping[str, Header]) -> Form:
     >>> points = Header((4, 2), np.dtype(float))
     >>> form = find_form("m.npz", {"mkpts0": points, "mkpts1": points})
     >>> form.points0, form.has_indices
-    ('mkpts0', False, False)
+    ('mkpts0', False)
     """
     if any(name in headers for name in INDEX_ARRAYS):
         return _indexed_form(place, headers)

@@ -67,7 +67,9 @@ def classify_files(
     out: Path | str | None = None,
     figure: Path | str | None = None,
 ) -> MatchSummary:
-    """Match two image files and decide which matches are right; the pair is rectified unless the settings say otherwise.
+    """Match two image files and decide which matches are right.
+
+    The pair is rectified unless the settings say otherwise.
 
     Args:
         left: Image of view 0.

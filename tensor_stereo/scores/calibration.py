@@ -14,8 +14,8 @@ from tensor_stereo.scores.tolerance import rising
 # benchmarks/training/calibrate_consensus.py on the real scenes of the training set.
 _CONSENSUS = (
     ((0.67, 0.45), (0.66, 2.40), (0.59, 3.14), (0.61, 3.63), (0.62, 4.03)),
-    ((0.67, 0.45), (0.66, 2.40), (0.59, 3.14), (0.61, 3.63), (0.62, 4.03)),
-    ((0.74, 0.25), (0.75, 2.04), (0.62, 2.75), (0.62, 3.14), (0.60, 3.45)),
+    ((0.70, 0.22), (0.69, 2.46), (0.65, 3.69), (0.71, 4.51), (0.74, 5.15)),
+    ((0.86, -0.11), (0.83, 1.96), (0.68, 3.10), (0.69, 3.70), (0.69, 4.09)),
 )
 _LEAST = 1e-4  # probability, of either outcome
 _NUM_KNOTS = 2048  # linear between them, the probability is off by less than 3e-6

@@ -197,7 +197,7 @@ def warp_view(image0: Tensor, image1: Tensor, to_view0: Tensor, keypoints1: Tens
     x = torch.arange(width, dtype=torch.float64, device=origin.device) + origin[0]
     y = torch.arange(height, dtype=torch.float64, device=origin.device) + origin[1]
     grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], 2).reshape(-1, 2)
-    m = torch.linalg.inv(to_view0)
+    m = torch.linalg.inv_ex(to_view0)[0]
     depth = grid @ m[2, :2] + m[2, 2]
     source = (grid @ m[:2, :2].t() + m[:2, 2]) / depth[:, None]
     rows, columns = image1.shape

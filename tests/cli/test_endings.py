@@ -148,12 +148,14 @@ def test_an_empty_result_of_matches_that_agree_fails(tmp_path: Path, capsys: pyt
     table = pl.DataFrame(np.hstack([points, turned]), schema=["x0", "y0", "x1", "y1"])
     table.write_csv(tmp_path / "m.csv")
     out = tmp_path / "made" / "kept.csv"
-    assert ends(["filter", str(tmp_path / "m.csv"), "--out", str(out), "--score", "consensus"]) == 1
+    assert ends(["filter", str(tmp_path / "m.csv"), "--out", str(out), "--rectified", "True"]) == 1
     error = capsys.readouterr().err
     assert "no match is kept, although 200 of 200 agree with their neighbours" in error
+    assert "--rectified" in error
     assert "--verdict cardinality" in error
     assert out.is_file()  # what was found is there
     assert ends(["filter", str(tmp_path / "m.csv"), "--out", str(out), "--verdict", "cardinality"]) == 0
+    assert ends(["filter", str(tmp_path / "m.csv"), "--out", str(out)]) == 0  # auto sees that the pair is none
     noise = np.random.default_rng(1).random((200, 4)) * 200
     pl.DataFrame(noise, schema=["x0", "y0", "x1", "y1"]).write_csv(tmp_path / "noise.csv")
     assert ends(["filter", str(tmp_path / "noise.csv"), "--out", str(out), "--score", "consensus"]) == 0

@@ -9,6 +9,7 @@ import torch
 
 from tensor_stereo import DelaunayFilter, FilterConfig, Matches, classify_matches
 from tensor_stereo.batching import collate_matches
+from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.verdicts import Verdicts
 from tests.interop.matchers import scene
 
@@ -48,3 +49,13 @@ def expected(matches: Matches, **settings: object) -> Verdicts:
 def expected_of_any_views(matches: Matches) -> Verdicts:
     """The default of files and adapters, whose pairs need not be rectified."""
     return expected(matches, rectified="auto")
+
+
+def exact_filter() -> DelaunayFilter:
+    """One for any two views whose bits do not depend on the other pairs of the batch, as those of ``learned`` do."""
+    return two_view_filter(score="consensus")
+
+
+def expected_exactly(matches: Matches) -> Verdicts:
+    """What :func:`exact_filter` says."""
+    return expected(matches, rectified="auto", score="consensus")

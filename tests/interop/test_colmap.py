@@ -13,8 +13,7 @@ import torch
 from tensor_stereo import Matches
 from tensor_stereo.interop import colmap, verdicts
 from tensor_stereo.interop.colmap import TABLE, filter_colmap
-from tensor_stereo.interop.glue_factory import two_view_filter
-from tests.interop.match_batches import expected_of_any_views
+from tests.interop.match_batches import exact_filter, expected_exactly
 from tests.interop.matchers import scene
 
 MAX_IMAGES = 2147483647  # COLMAP's documentation: pair_id = image_id1 * 2147483647 + image_id2, the smaller id first
@@ -91,7 +90,7 @@ def test_colmap_reads_the_inliers_and_the_table_holds_the_rest(pycolmap: Any, tm
     source, target = tmp_path / "in.db", tmp_path / "out.db"
     write_database(pycolmap, source, seed)
     before = source.read_bytes()
-    summary = filter_colmap(source, target, two_view_filter())
+    summary = filter_colmap(source, target, exact_filter())
     assert source.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.db", "out.db"]
     assert (summary.num_pairs, summary.num_matches) == (3, 75)
@@ -100,7 +99,7 @@ def test_colmap_reads_the_inliers_and_the_table_holds_the_rest(pycolmap: Any, tm
     kept = 0
     with closing(pycolmap.Database.open(str(target))) as database:
         for images, rows in some_pairs(seed).items():
-            verdict = expected_of_any_views(to_matches(seed, images, rows))
+            verdict = expected_exactly(to_matches(seed, images, rows))
             np.testing.assert_array_equal(database.read_matches(*images), rows[verdict.inlier])
             num_rows, num_cols, data, inlier, score, relation = table[pycolmap.image_pair_to_pair_id(*images)]
             assert (num_rows, num_cols) == (len(rows), 2)
@@ -123,7 +122,7 @@ def test_pairs_are_numbered_as_documented(pycolmap: Any) -> None:
 def test_the_copy_is_the_source_but_for_what_was_filtered(pycolmap: Any, tmp_path: Path) -> None:
     source, target = tmp_path / "in.db", tmp_path / "out.db"
     write_database(pycolmap, source, 0)
-    filter_colmap(source, target, two_view_filter())
+    filter_colmap(source, target, exact_filter())
     for text in ("SELECT * FROM cameras", "SELECT * FROM images", "SELECT * FROM keypoints", "PRAGMA user_version"):
         assert query(source, text) == query(target, text)
     schema = "SELECT name, sql FROM sqlite_master WHERE name != ? ORDER BY name".replace("?", f"'{TABLE}'")
@@ -139,18 +138,18 @@ def test_a_database_without_the_other_tables_and_blocks_make_no_difference(
     write_database(pycolmap, whole, 1)
     write_tables(tables, 1)
     outs = [tmp_path / f"out{k}.db" for k in range(3)]
-    filter_colmap(whole, outs[0], two_view_filter())
-    filter_colmap(tables, outs[1], two_view_filter())
+    filter_colmap(whole, outs[0], exact_filter())
+    filter_colmap(tables, outs[1], exact_filter())
     monkeypatch.setattr(verdicts, "BLOCK_MATCHES", 1)
-    filter_colmap(tables, outs[2], two_view_filter())
+    filter_colmap(tables, outs[2], exact_filter())
     one, two, three = (query(out, f"SELECT pair_id, rows, inlier, score, relation FROM {TABLE}") for out in outs)
     assert one == two == three
 
 
 def test_filtering_twice_replaces_the_verdicts(pycolmap: Any, tmp_path: Path) -> None:
     write_tables(tmp_path / "in.db", 0)
-    first = filter_colmap(tmp_path / "in.db", tmp_path / "once.db", two_view_filter())
-    second = filter_colmap(tmp_path / "once.db", tmp_path / "twice.db", two_view_filter())
+    first = filter_colmap(tmp_path / "in.db", tmp_path / "once.db", exact_filter())
+    second = filter_colmap(tmp_path / "once.db", tmp_path / "twice.db", exact_filter())
     assert 0 < second.num_matches == first.num_kept < first.num_matches
     assert query(tmp_path / "twice.db", f"SELECT sum(rows) FROM {TABLE}") == [(second.num_matches,)]
 
@@ -187,7 +186,7 @@ def test_wrong_rows_are_named_by_table_and_pair(pycolmap: Any, tmp_path: Path, c
     write_tables(source, 0)
     execute(source, change)
     with pytest.raises(ValueError, match=message) as caught:
-        filter_colmap(source, target, two_view_filter())
+        filter_colmap(source, target, exact_filter())
     assert str(source) in str(caught.value)
 
 
@@ -199,7 +198,7 @@ def test_keypoints_that_are_no_numbers_are_named_by_pair_and_row(pycolmap: Any, 
     points[row, 1] = np.nan
     execute(source, "UPDATE keypoints SET data = ? WHERE image_id = 2", points.tobytes())
     with pytest.raises(ValueError, match=rf"\(images 1 and 2\): keypoints1, row {row}, must be finite"):
-        filter_colmap(source, tmp_path / "out.db", two_view_filter())
+        filter_colmap(source, tmp_path / "out.db", exact_filter())
 
 
 @pytest.mark.parametrize(
@@ -222,7 +221,7 @@ def test_another_schema_is_refused(tmp_path: Path, change: str, message: str) ->
     with closing(sqlite3.connect(source)) as database:
         database.executescript(change)
     with pytest.raises(ValueError, match=message) as caught:
-        filter_colmap(source, tmp_path / "out.db", two_view_filter())
+        filter_colmap(source, tmp_path / "out.db", exact_filter())
     assert str(source) in str(caught.value)
 
 
@@ -233,20 +232,20 @@ def test_damaged_and_unfinished_databases_are_refused(pycolmap: Any, tmp_path: P
     for damaged in (data[:5000], data[:16] + b"x" * 500 + data[516:], data[: len(data) // 2]):
         source.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"in\.db is no readable COLMAP database"):
-            filter_colmap(source, target, two_view_filter())
+            filter_colmap(source, target, exact_filter())
     source.write_bytes(data)
     with closing(pycolmap.Database.open(str(source))) as database:
         database.write_matches(2, 2, rows_of(0, 4))
         with pytest.raises(ValueError, match=r"in\.db is not finished, see in\.db-wal"):
-            filter_colmap(source, target, two_view_filter())
-    assert filter_colmap(source, target, two_view_filter()).num_pairs == 4
+            filter_colmap(source, target, exact_filter())
+    assert filter_colmap(source, target, exact_filter()).num_pairs == 4
 
 
 def test_the_error_without_pycolmap_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     write_tables(tmp_path / "in.db", 0)
     with pytest.raises(ImportError, match=r"pycolmap must be installed to read in\.db"):
-        filter_colmap(tmp_path / "in.db", tmp_path / "out.db", two_view_filter())
+        filter_colmap(tmp_path / "in.db", tmp_path / "out.db", exact_filter())
 
 
 def test_a_full_disk_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,7 +259,7 @@ def test_a_full_disk_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(colmap, "_filter_copy", fill)
     with pytest.raises(OSError, match=r"the copy of .*in\.db cannot be written: database or disk is full"):
-        filter_colmap(tmp_path / "in.db", tmp_path / "out.db", two_view_filter())
+        filter_colmap(tmp_path / "in.db", tmp_path / "out.db", exact_filter())
 
 
 EMPTY_KEYPOINTS = (
@@ -292,12 +291,12 @@ def test_an_image_without_features_makes_empty_pairs(
 ) -> None:
     source, target = tmp_path / "in.db", tmp_path / "out.db"
     write_database(pycolmap, source, 0)
-    expected = filter_colmap(source, target, two_view_filter())
+    expected = filter_colmap(source, target, exact_filter())
     left = query(target, "SELECT rows, data FROM matches WHERE pair_id = 2147483649")
     execute(source, "PRAGMA foreign_keys = OFF")
     for change in (keypoints_are, matches_are, other):
         execute(source, change)
-    summary = filter_colmap(source, target, two_view_filter())
+    summary = filter_colmap(source, target, exact_filter())
     assert summary.num_pairs == (1 if matches_are.startswith("DELETE") else expected.num_pairs)
     assert summary.num_matches == 45
     assert query(target, "SELECT rows, data FROM matches WHERE pair_id = 2147483649") == left
@@ -321,6 +320,6 @@ def test_null_is_empty_where_there_is_no_data_and_an_error_where_there_is(tmp_pa
         execute(source, f"UPDATE matches SET {change}")
         if has_data:
             with pytest.raises(ValueError, match="table 'matches'"):
-                filter_colmap(source, tmp_path / "out.db", two_view_filter())
+                filter_colmap(source, tmp_path / "out.db", exact_filter())
         else:
-            assert filter_colmap(source, tmp_path / "out.db", two_view_filter()).num_matches == 0
+            assert filter_colmap(source, tmp_path / "out.db", exact_filter()).num_matches == 0

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from tensor_stereo import DelaunayFilter
+from tensor_stereo import ConsensusConfig, DelaunayFilter
 from tensor_stereo.batching import select_matches
 from tensor_stereo.interop.glue_factory import GlueFactoryFilter, from_glue_factory, to_glue_factory
+from tests.interop.match_batches import exact_filter
 from tests.interop.matchers import SmoothFilter, scene
 
 
@@ -100,10 +101,10 @@ def test_both_views_agree_after_the_filter(seed: int) -> None:
 
 @given(seeds)
 def test_batch_equals_loop(seed: int) -> None:
-    data = predictions(seed)
-    batched = GlueFactoryFilter()(data)
+    data, module = predictions(seed), GlueFactoryFilter(exact_filter())
+    batched = module(data)
     for b in range(3):
-        for name, values in GlueFactoryFilter()({key: value[b : b + 1] for key, value in data.items()}).items():
+        for name, values in module({key: value[b : b + 1] for key, value in data.items()}).items():
             assert torch.equal(values[0], batched[name][b]), name
 
 
@@ -198,17 +199,31 @@ def test_missing_entries_and_bad_verdicts_are_named() -> None:
         to_glue_factory(data, indices[:, :2], torch.ones(len(indices), dtype=torch.bool))
 
 
-@pytest.mark.parametrize(
-    ("consensus", "tolerance"), [({"slope": 0.3}, None), ({}, None), (None, None), ({"row_tolerance_px": 2.0}, 2.0)]
-)
-def test_a_consensus_in_the_configuration_is_one_of_any_two_views(
-    consensus: dict[str, Any] | None, tolerance: float | None
-) -> None:
+@pytest.mark.parametrize("consensus", [{"slope": 0.3}, {}, None, {"row_tolerance_px": 2.0}])
+def test_a_consensus_in_the_configuration_is_one_of_any_two_views(consensus: dict[str, Any] | None) -> None:
     module = GlueFactoryFilter.from_conf({"score": "consensus", "consensus": consensus}).filter
     assert isinstance(module, DelaunayFilter)
-    assert module.config.consensus.row_tolerance_px == tolerance
-    if consensus and "slope" in consensus:
-        assert module.config.consensus.slope == consensus["slope"]
+    assert module.config.consensus == ConsensusConfig(**(consensus or {}))
+    assert module.config.rectified == "auto"
+
+
+@pytest.mark.parametrize("settings", [{}, {"rectified": "auto"}, {"rectified": True}, {"rectified": False}])
+def test_the_configuration_says_whether_pairs_are_rectified(settings: dict[str, Any]) -> None:
+    data = predictions(5)
+    matches, indices = from_glue_factory(data)
+    run = DelaunayFilter(**({"rectified": "auto"} | settings))
+    output = run(matches)
+    expected = to_glue_factory(data, indices, output.inlier, output.score)
+    result = GlueFactoryFilter.from_conf(settings)(data)
+    assert result.keys() == expected.keys()
+    for name, values in result.items():
+        assert torch.equal(values, expected[name]), name
+
+
+def test_other_values_of_rectified_are_refused() -> None:
+    for value in (1, "yes", None):
+        with pytest.raises(ValueError, match="rectified must be one of True, False, auto, got"):
+            GlueFactoryFilter.from_conf({"rectified": value})
 
 
 def test_weights_can_be_trained_by_the_configuration() -> None:

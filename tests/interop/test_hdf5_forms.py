@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from tensor_stereo import Matches, filter_file
+from tensor_stereo.configs import FileFilterConfig
 from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.hdf5_matches import filter_hdf5
 from tests.interop.hloc_files import IMAGES, features, paths, write_features, write_matches
-from tests.interop.match_batches import expected_of_any_views
+from tests.interop.match_batches import exact_filter, expected_exactly
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed")
 
@@ -58,7 +59,7 @@ def test_disk_keeps_the_inliers_and_the_attributes_hold_the_rest(tmp_path: Path,
     source, target, keypoints = paths(tmp_path)
     points, pairs = write_disk_keypoints(keypoints, 4), disk_pairs(4)
     write_disk_matches(source, pairs, dtype, in_rows)
-    summary = filter_hdf5(source, target, two_view_filter(), keypoints)
+    summary = filter_hdf5(source, target, exact_filter(), keypoints)
     assert (summary.num_pairs, summary.num_matches) == (4, 92)
     with h5py.File(target, "r") as file:
         assert set(file) == {name0 for name0, _ in pairs}
@@ -67,7 +68,7 @@ def test_disk_keeps_the_inliers_and_the_attributes_hold_the_rest(tmp_path: Path,
                 torch.from_numpy(points[name][rows[:, view]].astype(np.float64))
                 for view, name in enumerate((name0, name1))
             )
-            expected = expected_of_any_views(Matches(left, right, torch.tensor([0, len(rows)])))
+            expected = expected_exactly(Matches(left, right, torch.tensor([0, len(rows)])))
             dataset = file[name0][name1]
             kept = dataset[()] if in_rows else dataset[()].T
             np.testing.assert_array_equal(kept, rows[expected.inlier])
@@ -92,7 +93,7 @@ def test_many_matches_fit_into_the_attributes(tmp_path: Path) -> None:
     rows = np.repeat(np.arange(len(grid))[None], 2, 0)
     with h5py.File(source, "w") as file:
         file["a/b"] = rows
-    assert filter_hdf5(source, target, two_view_filter(), keypoints).num_kept == len(grid)
+    assert filter_hdf5(source, target, exact_filter(), keypoints).num_kept == len(grid)
     with h5py.File(target, "r") as file:
         np.testing.assert_array_equal(file["a/b"].attrs["putative_matches"], rows)
 
@@ -112,7 +113,7 @@ def test_wrong_matches_of_disk_are_named_by_pair(tmp_path: Path, values: np.ndar
     with h5py.File(source, "w") as file:
         file[f"{NAMES[0]}/{NAMES[1]}"] = values
     with pytest.raises(ValueError, match=message):
-        filter_hdf5(source, target, two_view_filter(), keypoints)
+        filter_hdf5(source, target, exact_filter(), keypoints)
 
 
 def test_an_image_that_disk_did_not_see_is_named(tmp_path: Path) -> None:
@@ -121,7 +122,7 @@ def test_an_image_that_disk_did_not_see_is_named(tmp_path: Path) -> None:
     with h5py.File(source, "w") as file:
         file["1/9"] = np.zeros((2, 5), dtype=np.int64)
     with pytest.raises(ValueError, match=r"'9' must name one image of .*features\.h5, got none"):
-        filter_hdf5(source, target, two_view_filter(), keypoints)
+        filter_hdf5(source, target, exact_filter(), keypoints)
 
 
 def exported(seed: int) -> dict[str, np.ndarray]:
@@ -152,7 +153,7 @@ def write_exported(path: Path, pairs: dict[str, int]) -> dict[str, dict[str, np.
 def test_exports_of_glue_factory_need_no_other_file(tmp_path: Path) -> None:
     source, target, _ = paths(tmp_path)
     arrays = write_exported(source, {"v_wall/1_2": 1, "v_wall/1_3": 2, "plain": 3})
-    summary = filter_file(source, target)
+    summary = filter_file(source, target, config=FileFilterConfig(score="consensus"))
     assert (summary.num_pairs, summary.num_matches) == (3, 120)
     with h5py.File(target, "r") as file:
         for name, given in arrays.items():
@@ -164,7 +165,7 @@ def test_exports_of_glue_factory_need_no_other_file(tmp_path: Path) -> None:
                 torch.from_numpy(given[f"keypoints{view}"][rows].astype(np.float64))
                 for view, rows in enumerate((rows0, rows1))
             )
-            expected = expected_of_any_views(Matches(left, right, torch.tensor([0, 40]), cost))
+            expected = expected_exactly(Matches(left, right, torch.tensor([0, 40]), cost))
             np.testing.assert_array_equal(group["inlier"][()][rows0], expected.inlier)
             np.testing.assert_array_equal(group["relation"][()][rows0], expected.relation)
             matches0, matches1 = np.full(50, -1), np.full(50, -1)
@@ -224,7 +225,7 @@ def test_datasets_of_the_user_survive(tmp_path: Path) -> None:
         for name, values in users.items():
             file["a/b"][name] = values
     for score in ("consensus", "none", "consensus"):
-        filter_hdf5(source, target, two_view_filter(score=score), None)
+        filter_hdf5(source, target, two_view_filter(verdict="cardinality", score=score), None)
         target.replace(source)
         with h5py.File(source, "r") as file:
             group = file["a/b"]
@@ -241,7 +242,7 @@ def test_attributes_of_the_user_survive(tmp_path: Path) -> None:
     with h5py.File(source, "r+") as file:
         file["1/2"].attrs["score"] = 0.5
     for _ in range(2):
-        filter_hdf5(source, target, two_view_filter(), keypoints)
+        filter_hdf5(source, target, exact_filter(), keypoints)
         target.replace(source)
     with h5py.File(source, "r") as file:
         attributes = file["1/2"].attrs

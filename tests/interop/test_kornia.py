@@ -21,6 +21,7 @@ from tensor_stereo.interop.kornia import (
     to_lightglue,
     to_loftr,
 )
+from tests.interop.match_batches import exact_filter
 from tests.interop.matchers import SmoothFilter, scene
 
 
@@ -89,7 +90,7 @@ def test_lightglue_output_comes_back_unchanged_if_all_matches_are_kept() -> None
 def test_lightglue_lists_and_indices_hold_the_same_inliers() -> None:
     data, output = run_lightglue()
     matches, indices = from_lightglue(data, output)
-    verdict = two_view_filter()(matches)
+    verdict = two_view_filter(verdict="cardinality", score="learned")(matches)  # the probability keeps none of noise
     assert 0 < int(verdict.inlier.sum()) < len(indices)
     back = to_lightglue(output, indices, verdict.inlier, verdict.score)
     again, kept = from_lightglue(data, back)
@@ -127,7 +128,8 @@ def test_loftr_rows_become_ragged_pairs_and_come_back(loftr_output: dict[str, Te
 
 
 def test_loftr_inliers_are_those_of_each_pair_alone(loftr_output: dict[str, Tensor]) -> None:
-    verdict = two_view_filter()(from_loftr(loftr_output))
+    run = exact_filter()
+    verdict = run(from_loftr(loftr_output))
     kept = to_loftr(loftr_output, verdict.inlier, verdict.score)
     assert 0 < len(kept["confidence"]) < len(loftr_output["confidence"])
     for b in range(2):
@@ -136,7 +138,7 @@ def test_loftr_inliers_are_those_of_each_pair_alone(loftr_output: dict[str, Tens
             "batch_indexes": torch.zeros(rows.sum())
         }
         pair["batch_indexes"] = pair["batch_indexes"].long()
-        alone = two_view_filter()(from_loftr(pair))
+        alone = run(from_loftr(pair))
         here = kept["batch_indexes"] == b
         assert torch.equal(kept["keypoints0"][here], pair["keypoints0"][alone.inlier])
         assert torch.equal(kept["confidence"][here], (pair["confidence"] * alone.score)[alone.inlier])

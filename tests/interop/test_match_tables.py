@@ -19,7 +19,7 @@ from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.match_tables import filter_table
 from tensor_stereo.pipeline import run_pipeline
 from tensor_stereo.reports.pair import match_table
-from tests.interop.match_batches import batch, expected_of_any_views
+from tests.interop.match_batches import batch, exact_filter, expected_exactly
 
 ENDINGS = (".csv", ".parquet")
 NAMES = [relation.name.lower() for relation in Relation]
@@ -42,7 +42,7 @@ def table_of(matches: Matches) -> pl.DataFrame:
 def filtered(folder: Path, table: pl.DataFrame, ending: str) -> pl.DataFrame:
     source, target = folder / f"in{ending}", folder / f"out{ending}"
     table.write_csv(source) if ending == ".csv" else table.write_parquet(source)
-    summary = filter_table(source, target, two_view_filter())
+    summary = filter_table(source, target, exact_filter())
     types = {"inlier": pl.Boolean, "score": pl.Float64, "relation": pl.String}
     result = pl.read_csv(target, schema_overrides=types) if ending == ".csv" else pl.read_parquet(target)
     assert summary.num_matches == len(result)
@@ -53,7 +53,7 @@ def filtered(folder: Path, table: pl.DataFrame, ending: str) -> pl.DataFrame:
 
 def assert_verdicts(result: pl.DataFrame, matches: Matches, rows: np.ndarray | slice = slice(None)) -> None:
     """Row ``rows[k]`` of the table must be match k."""
-    verdicts = expected_of_any_views(matches)
+    verdicts = expected_exactly(matches)
     np.testing.assert_array_equal(result["inlier"].to_numpy()[rows], verdicts.inlier)
     np.testing.assert_array_equal(result["score"].to_numpy()[rows], verdicts.score)
     assert result["relation"].to_numpy()[rows].tolist() == [NAMES[value] for value in verdicts.relation]
@@ -103,7 +103,7 @@ def test_other_columns_of_a_csv_keep_their_text(tmp_path: Path) -> None:
     source, target = tmp_path / "in.csv", tmp_path / "out.csv"
     rows = ["1.50,01,-2e0,+4,,007,1.0", '9,1,8,1,"a, ""b""",,nan', " 2,7 ,1,7,ü,x,inf"]
     source.write_text("\n".join([f"{HEADER},name,code,note", *rows]) + "\n")
-    filter_table(source, target, two_view_filter())
+    filter_table(source, target, exact_filter())
     with source.open(newline="") as before, target.open(newline="") as after:
         for row, given_ in zip(csv.reader(after), csv.reader(before), strict=True):
             assert row[:7] == given_
@@ -123,7 +123,7 @@ def test_other_columns_of_a_parquet_file_keep_their_types(tmp_path: Path) -> Non
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_what_classify_writes_is_read_back(tmp_path: Path, ending: str) -> None:
     pair = SyntheticDataset(1, seed=1)[0]
-    settings = {"verdict": "cardinality", "score": "consensus", "rectified": "auto"}
+    settings = {"score": "consensus", "rectified": "auto"}
     for config in (PipelineConfig(**settings), PipelineConfig(**settings, constrained=True)):  # type: ignore[arg-type]
         output = run_pipeline([(pair.image0, pair.image1)], config)
         table = match_table(output, config)
@@ -149,7 +149,7 @@ def test_tables_without_rows_and_pairs_of_one_match_pass(tmp_path: Path, ending:
     result = filtered(tmp_path, table, ending)
     assert result.select("inlier", "score", "relation").rows() == [(False, 0.0, "untested")]
     assert len(filtered(tmp_path, table[:0], ending)) == 0
-    assert filter_table(tmp_path / f"in{ending}", tmp_path / f"out{ending}", two_view_filter()).num_pairs == 0
+    assert filter_table(tmp_path / f"in{ending}", tmp_path / f"out{ending}", exact_filter()).num_pairs == 0
 
 
 def test_pairs_may_be_categories(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_wrong_csv_names_file_row_and_column(tmp_path: Path, text: str, messag
     source = tmp_path / "in.csv"
     source.write_text(text)
     with pytest.raises(ValueError, match=message):
-        filter_table(source, tmp_path / "out.csv", two_view_filter())
+        filter_table(source, tmp_path / "out.csv", exact_filter())
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -190,7 +190,7 @@ def test_a_wrong_csv_names_file_row_and_column(tmp_path: Path, text: str, messag
 def test_what_is_no_text_is_refused(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "in.csv").write_bytes(data)
     with pytest.raises(ValueError, match=r"in\.csv"):
-        filter_table(tmp_path / "in.csv", tmp_path / "out.csv", two_view_filter())
+        filter_table(tmp_path / "in.csv", tmp_path / "out.csv", exact_filter())
 
 
 @pytest.mark.parametrize("compress", [gzip.compress, zlib.compress, lambda data: zlib.compress(data, 9)])
@@ -198,7 +198,7 @@ def test_a_compressed_csv_is_not_inflated(tmp_path: Path, compress: object) -> N
     source = tmp_path / "in.csv"
     source.write_bytes(compress(f"{HEADER}\n1,2,3,4\n".encode()))  # type: ignore[operator]
     with pytest.raises(ValueError, match=r"in\.csv is compressed"):
-        filter_table(source, tmp_path / "out.csv", two_view_filter())
+        filter_table(source, tmp_path / "out.csv", exact_filter())
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_damaged_parquet_is_named_and_does_not_end_the_process(tmp_path: Path, p
     }
     source.write_bytes(damaged[place])
     with pytest.raises(ValueError, match=r"in\.parquet is no readable Parquet file: "):
-        filter_table(source, tmp_path / "out.parquet", two_view_filter())
+        filter_table(source, tmp_path / "out.parquet", exact_filter())
     assert not (tmp_path / "out.parquet").exists()
 
 
@@ -254,7 +254,7 @@ def test_names_are_no_patterns(tmp_path: Path, name: str) -> None:
     table = table_of(batch(0, [9]))
     filtered(tmp_path, table, ending)
     (tmp_path / f"in{ending}").rename(tmp_path / name)
-    assert filter_table(tmp_path / name, tmp_path / f"out{ending}", two_view_filter()).num_matches == 9
+    assert filter_table(tmp_path / name, tmp_path / f"out{ending}", exact_filter()).num_matches == 9
 
 
 def test_columns_of_the_user_are_kept(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def filtered_as(
 ) -> pl.DataFrame:
     source, target = folder / f"in{ending}", folder / f"out{ending}"
     table_files.write_table(table, source)
-    filter_table(source, target, two_view_filter(score=score), score_name=score_name)
+    filter_table(source, target, two_view_filter(verdict="cardinality", score=score), score_name=score_name)
     return table_files.read_csv(target) if ending == ".csv" else table_files.read_parquet(target)
 
 
@@ -316,7 +316,7 @@ def test_tables_of_other_tools_are_read(tmp_path: Path) -> None:
         values = [f"{float(value):.1f}" if name == "group" else str(value) for name, value in row.items()]
         lines.append(", ".join(values))
     (tmp_path / "in.csv").write_text("\ufeff" + "\r\n".join([*lines, "", " ", ""]), encoding="utf-8", newline="")
-    filter_table(tmp_path / "in.csv", tmp_path / "out.csv", two_view_filter())
+    filter_table(tmp_path / "in.csv", tmp_path / "out.csv", exact_filter())
     result = table_files.read_csv(tmp_path / "out.csv")
     assert len(result) == len(table)
     for name in ("inlier", "score", "relation"):
@@ -327,7 +327,7 @@ def test_tables_of_other_tools_are_read(tmp_path: Path) -> None:
 def test_a_group_that_is_no_integer_is_named(tmp_path: Path, value: str) -> None:
     (tmp_path / "in.csv").write_text(f"{HEADER},group\n1,2,3,4,2.0\n1,2,3,4,{value}\n")
     with pytest.raises(ValueError, match=r"in\.csv, line 3: column 'group' (must be an integer|is empty)"):
-        filter_table(tmp_path / "in.csv", tmp_path / "out.csv", two_view_filter())
+        filter_table(tmp_path / "in.csv", tmp_path / "out.csv", exact_filter())
 
 
 def test_a_pair_is_one_however_it_is_spelled(tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from tensor_stereo import Matches
 from tensor_stereo.batching import split_matches
 from tensor_stereo.interop import npz
-from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.npz import filter_npz
-from tests.interop.match_batches import batch, expected_of_any_views
+from tests.interop.match_batches import batch, exact_filter, expected_exactly
 
 
 def arrays_of(matches: Matches) -> dict[str, np.ndarray]:
@@ -27,7 +26,7 @@ def arrays_of(matches: Matches) -> dict[str, np.ndarray]:
 def filtered(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     source, target = folder / "in.npz", folder / "out.npz"
     np.savez(source, **arrays)  # type: ignore[arg-type]
-    filter_npz(source, target, two_view_filter())
+    filter_npz(source, target, exact_filter())
     with np.load(target, allow_pickle=False) as result:
         return dict(result)
 
@@ -63,7 +62,7 @@ def test_rows_get_the_verdicts_of_the_same_matches(tmp_path: Path, has_group: bo
     assert set(result) == {*arrays, "inlier", "score", "relation"}
     for name, values in arrays.items():
         np.testing.assert_array_equal(result[name], values)
-    for name, values in expected_of_any_views(matches)._asdict().items():
+    for name, values in expected_exactly(matches)._asdict().items():
         assert result[name].dtype == values.dtype
         np.testing.assert_array_equal(result[name], values)
 
@@ -110,7 +109,7 @@ def test_partners_of_keypoints_get_a_verdict_each(
     order = np.argsort(rows0)
     cost = torch.from_numpy(1 - arrays["matching_scores0"][rows0[order]]) if has_scores else None
     same = Matches(matches.keypoints0[order], matches.keypoints1[order], matches.ptr, cost)
-    for name, values in expected_of_any_views(same)._asdict().items():
+    for name, values in expected_exactly(same)._asdict().items():
         np.testing.assert_array_equal(result[name][rows0[order]], values)
         assert result[name].shape == (50,)
         assert not result[name][matches0 < 0].any()
@@ -120,7 +119,7 @@ def test_other_arrays_and_their_compression_are_carried_through(tmp_path: Path) 
     extra = {"names": np.array(["a", "ü"]), "empty": np.zeros((0, 7), dtype=np.float16), "scalar": np.array(3)}
     source, target = tmp_path / "in.npz", tmp_path / "out.npz"
     np.savez_compressed(source, **arrays_of(batch(6)), **extra)  # type: ignore[arg-type]
-    filter_npz(source, target, two_view_filter())
+    filter_npz(source, target, exact_filter())
     with np.load(target, allow_pickle=False) as result:
         for name, values in extra.items():
             np.testing.assert_array_equal(result[name], values)
@@ -201,7 +200,7 @@ def test_keypoints_out_of_range_are_named_by_row_and_pair(tmp_path: Path, name: 
 def test_lying_headers_and_names_are_refused(tmp_path: Path, members: dict[str, bytes], message: str) -> None:
     source = write_archive(tmp_path / "in.npz", {**GOOD, **members})
     with pytest.raises(ValueError, match=message) as caught:
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
     assert str(source) in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
 
@@ -212,7 +211,7 @@ def test_more_rows_than_the_limit_are_refused_before_they_are_read(
     monkeypatch.setattr(npz, "MAX_ROWS", 5)
     source = write_archive(tmp_path / "in.npz", GOOD)
     with pytest.raises(ValueError, match="array 'keypoints0' must have at most 5 rows, got 6"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
 
 
 @pytest.mark.parametrize(("field", "size", "claimed"), [(24, 2**32 - 2, 2**32 - 2), (20, 2**20, 10**6 + 128)])
@@ -223,7 +222,7 @@ def test_sizes_that_the_archive_cannot_hold_are_refused(tmp_path: Path, field: i
     data[entry + field : entry + field + 4] = size.to_bytes(4, "little")
     source.write_bytes(data)
     with pytest.raises(ValueError, match=f"array 'z' claims {claimed} bytes, which the archive cannot hold"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
 
 
 def test_a_name_that_occurs_twice_is_refused(tmp_path: Path) -> None:
@@ -231,13 +230,13 @@ def test_a_name_that_occurs_twice_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(source, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("keypoints0.npy", GOOD["keypoints0.npy"])
     with pytest.raises(ValueError, match="holds the array 'keypoints0' twice"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
 
 
 def test_other_compressions_are_refused(tmp_path: Path) -> None:
     source = write_archive(tmp_path / "in.npz", GOOD, zipfile.ZIP_LZMA)
     with pytest.raises(ValueError, match="array 'keypoints0' must be stored or deflated"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
 
 
 def test_damaged_data_is_noticed(tmp_path: Path) -> None:
@@ -246,13 +245,13 @@ def test_damaged_data_is_noticed(tmp_path: Path) -> None:
     place = data.index(np.array(5.0).tobytes())
     source.write_bytes(data[:place] + b"\x01" + data[place + 1 :])
     with pytest.raises(ValueError, match=r"in\.npz is no readable archive: Bad CRC-32"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
     source.write_bytes(data[:-30])
     with pytest.raises(ValueError, match=r"in\.npz is no readable archive"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
     source.write_bytes(data[40:])  # its directory points before its beginning
     with pytest.raises(ValueError, match="which the archive cannot hold"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
 
 
 @pytest.mark.parametrize("text", [b"{'a':" * 1900, b"-" * 9000 + b"1", b"(" * 9000])
@@ -260,7 +259,7 @@ def test_a_header_nested_too_deeply_is_refused(tmp_path: Path, text: bytes) -> N
     head = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
     source = write_archive(tmp_path / "in.npz", {**GOOD, "z.npy": head})
     with pytest.raises(ValueError, match="array 'z' has no readable header"):
-        filter_npz(source, tmp_path / "out.npz", two_view_filter())
+        filter_npz(source, tmp_path / "out.npz", exact_filter())
 
 
 def test_headers_of_python_2_are_read(tmp_path: Path) -> None:
@@ -269,4 +268,4 @@ def test_headers_of_python_2_are_read(tmp_path: Path) -> None:
     old = points.replace(b"(6, 2), }", b"(6L, 2L)}")
     assert old != points
     source = write_archive(tmp_path / "in.npz", {**GOOD, "keypoints0.npy": old})
-    assert filter_npz(source, tmp_path / "out.npz", two_view_filter()).num_matches == 6
+    assert filter_npz(source, tmp_path / "out.npz", exact_filter()).num_matches == 6

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from tensor_stereo import Matches, filter_file
-from tensor_stereo.configs import FilterConfig
+from tensor_stereo.configs import FileFilterConfig, FilterConfig
 from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.npz import filter_npz
 from tensor_stereo.interop.verdicts import Verdicts
-from tests.interop.match_batches import batch, expected_of_any_views
+from tests.interop.match_batches import batch, exact_filter, expected_exactly
 from tests.interop.test_npz import filtered
 
 Arrays = dict[str, np.ndarray]
@@ -39,7 +39,7 @@ def superglue(seed: int) -> tuple[Arrays, Verdicts, np.ndarray]:
     partner[rows[:, 0]] = rows[:, 1]
     confidence[rows[:, 0]] = np.random.default_rng(seed).random(40).astype(np.float32)
     cost = torch.from_numpy(1 - confidence[rows[:, 0]].astype(np.float64))
-    expected = expected_of_any_views(Matches(plain.keypoints0, plain.keypoints1, plain.ptr, cost))
+    expected = expected_exactly(Matches(plain.keypoints0, plain.keypoints1, plain.ptr, cost))
     return {**points, "matches": partner, "match_confidence": confidence}, expected, rows[:, 0]
 
 
@@ -47,9 +47,7 @@ def lightglue(seed: int) -> tuple[Arrays, Verdicts, np.ndarray]:
     """LightGlue's ``matches`` (S, 2) and ``scores`` (S,), as ``rbd`` leaves them."""
     points, plain, rows = scattered(seed)
     scores = np.random.default_rng(seed).random(40)
-    expected = expected_of_any_views(
-        Matches(plain.keypoints0, plain.keypoints1, plain.ptr, torch.from_numpy(1 - scores))
-    )
+    expected = expected_exactly(Matches(plain.keypoints0, plain.keypoints1, plain.ptr, torch.from_numpy(1 - scores)))
     return {**points, "matches": rows, "scores": scores, "stop": np.array(9)}, expected, np.arange(40)
 
 
@@ -58,7 +56,7 @@ def loftr(seed: int) -> tuple[Arrays, Verdicts, np.ndarray]:
     matches = batch(seed, [40])
     confidence = np.random.default_rng(seed).random(40)
     cost = torch.from_numpy(1 - confidence)
-    expected = expected_of_any_views(Matches(matches.keypoints0, matches.keypoints1, matches.ptr, cost))
+    expected = expected_exactly(Matches(matches.keypoints0, matches.keypoints1, matches.ptr, cost))
     arrays = {"mkpts0_f": matches.keypoints0.numpy(), "mkpts1_f": matches.keypoints1.numpy(), "mconf": confidence}
     return {**arrays, "mkpts0_c": np.zeros((40, 2)), "mkpts1_c": np.zeros((40, 2))}, expected, np.arange(40)
 
@@ -67,7 +65,7 @@ def matched_points(seed: int) -> tuple[Arrays, Verdicts, np.ndarray]:
     """``mkpts0``, ``mkpts1`` beside all keypoints, of which both views have equally many."""
     points, plain, _ = scattered(seed)
     arrays = {"mkpts0": plain.keypoints0.numpy(), "mkpts1": plain.keypoints1.numpy(), **points}
-    return arrays, expected_of_any_views(plain), np.arange(40)
+    return arrays, expected_exactly(plain), np.arange(40)
 
 
 FORMS = (superglue, lightglue, loftr, matched_points)
@@ -109,7 +107,7 @@ def test_rows_of_several_pairs_may_be_mixed(tmp_path: Path, name: str) -> None:
         name: pair[order],
     }
     result = filtered(tmp_path, arrays)
-    expected = expected_of_any_views(Matches(matches.keypoints0, matches.keypoints1, matches.ptr))
+    expected = expected_exactly(Matches(matches.keypoints0, matches.keypoints1, matches.ptr))
     # duplicates are told by their order in the file, so the rows of each pair are compared in that order
     for number in (7, 3, 9):
         rows = np.flatnonzero(pair[order] == number)
@@ -118,7 +116,7 @@ def test_rows_of_several_pairs_may_be_mixed(tmp_path: Path, name: str) -> None:
             torch.from_numpy(arrays["keypoints1"][rows]),
             torch.tensor([0, len(rows)]),
         )
-        for key, values in expected_of_any_views(part)._asdict().items():
+        for key, values in expected_exactly(part)._asdict().items():
             np.testing.assert_array_equal(result[key][rows], values)
     assert len(expected.inlier) == 75
 
@@ -129,7 +127,7 @@ def test_kornias_dictionary_has_its_confidence_as_cost(tmp_path: Path) -> None:
     arrays = {"keypoints0": matches.keypoints0.numpy(), "keypoints1": matches.keypoints1.numpy()}
     result = filtered(tmp_path, {**arrays, "confidence": confidence, "batch_indexes": np.zeros(40, dtype=np.int64)})
     cost = torch.from_numpy(1 - confidence)
-    expected = expected_of_any_views(Matches(matches.keypoints0, matches.keypoints1, matches.ptr, cost))
+    expected = expected_exactly(Matches(matches.keypoints0, matches.keypoints1, matches.ptr, cost))
     for name, values in expected._asdict().items():
         np.testing.assert_array_equal(result[name], values)
 
@@ -177,7 +175,7 @@ def test_an_array_that_may_pair_the_rows_is_refused_by_name(tmp_path: Path, name
 def test_what_says_nothing_of_the_rows_is_carried_through(tmp_path: Path, name: str, values: np.ndarray) -> None:
     points = np.arange(12.0).reshape(6, 2)
     np.savez(tmp_path / "in.npz", keypoints0=points, keypoints1=points, **{name: values})
-    filter_npz(tmp_path / "in.npz", tmp_path / "out.npz", two_view_filter())
+    filter_npz(tmp_path / "in.npz", tmp_path / "out.npz", exact_filter())
     with zipfile.ZipFile(tmp_path / "in.npz") as before, zipfile.ZipFile(tmp_path / "out.npz") as after:
         assert before.read(f"{name}.npy") == after.read(f"{name}.npy")
 
@@ -193,9 +191,11 @@ def test_the_pair_of_a_row_is_not_given_twice(tmp_path: Path) -> None:
 def test_matches_of_every_form_tell_whether_their_pair_is_rectified(tmp_path: Path, form: Any) -> None:
     arrays, expected, places = form(4)
     np.savez(tmp_path / "in.npz", **arrays)
-    filter_file(tmp_path / "in.npz", tmp_path / "out.npz", config=None)
+    summary = filter_file(tmp_path / "in.npz", tmp_path / "out.npz", config=FileFilterConfig(score="consensus"))
+    assert (summary.num_pairs, summary.num_rectified) == (1, 1)
     with np.load(tmp_path / "out.npz") as result:
         np.testing.assert_array_equal(result["inlier"][places], expected.inlier)
+        np.testing.assert_array_equal(result["score"][places], expected.score)
 
 
 def own(seed: int, **more: np.ndarray) -> Arrays:
@@ -211,7 +211,8 @@ def test_arrays_of_the_user_survive(tmp_path: Path) -> None:
     source, target = tmp_path / "in.npz", tmp_path / "out.npz"
     np.savez(source, **arrays)
     for score in ("consensus", "none", "consensus", "consensus"):
-        filter_npz(source, target, two_view_filter(score=score))
+        verdict = "cardinality" if score == "none" else "score"
+        filter_npz(source, target, two_view_filter(verdict=verdict, score=score))
         target.replace(source)
         with np.load(source) as result:
             scored = {"filter_score_2"} if score != "none" else set()
@@ -220,7 +221,7 @@ def test_arrays_of_the_user_survive(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(result[name], values)
             if scored:
                 np.testing.assert_array_equal(result["filter_score_2"], plain["score"])
-            np.testing.assert_array_equal(result["filter_inlier"], plain["inlier"])
+                np.testing.assert_array_equal(result["filter_inlier"], plain["inlier"])
             np.testing.assert_array_equal(result["relation"], plain["relation"])
 
 
@@ -241,6 +242,6 @@ def test_the_name_of_the_score_can_be_chosen_and_is_replaced_by_a_second_filter(
 def test_a_score_of_an_earlier_filter_does_not_outlive_its_verdicts(tmp_path: Path) -> None:
     source, target = tmp_path / "in.npz", tmp_path / "out.npz"
     np.savez(source, **filtered(tmp_path, own(3)))
-    filter_npz(source, target, two_view_filter(score="none"))
+    filter_npz(source, target, two_view_filter(verdict="cardinality", score="none"))
     with np.load(target) as result:
         assert set(result) == {"keypoints0", "keypoints1", "inlier", "relation"}

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from tensor_stereo import Matches
 from tensor_stereo.batching import collate_matches, split_matches
 from tensor_stereo.interop import verdicts
-from tensor_stereo.interop.glue_factory import two_view_filter
 from tensor_stereo.interop.verdicts import FilterSummary, Verdicts, filter_each, filter_matches
 from tensor_stereo.modules import FilterOutput
-from tests.interop.match_batches import batch, expected_of_any_views
+from tests.interop.match_batches import batch, exact_filter, expected_exactly
 
 sizes = st.lists(st.integers(0, 30), max_size=8)
 seeds = st.integers(0, 10**6)
@@ -34,7 +33,7 @@ class Recorder:
 
     def __call__(self, matches: Matches) -> FilterOutput:
         self.seen.append(matches)
-        return two_view_filter()(matches)
+        return exact_filter()(matches)
 
 
 @given(seeds, sizes, st.integers(1, 70))
@@ -43,7 +42,7 @@ def test_blocks_hold_whole_pairs_and_change_nothing(seed: int, lengths: list[int
     recorder = Recorder()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(verdicts, "BLOCK_MATCHES", block)
-        assert_same(filter_matches(matches, recorder), expected_of_any_views(matches))
+        assert_same(filter_matches(matches, recorder), expected_exactly(matches))
     assert [n for part in recorder.seen for n in part.ptr.diff().tolist()] == matches.ptr.diff().tolist()
     assert all(part.num_matches <= block or part.num_pairs == 1 for part in recorder.seen)
 
@@ -56,8 +55,8 @@ def test_everything_that_fits_runs_at_once() -> None:
 
 def test_a_batch_without_pairs_has_no_verdicts() -> None:
     empty = Matches(torch.zeros(0, 2), torch.zeros(0, 2), torch.tensor([0]))
-    assert [len(values) for values in filter_matches(empty, two_view_filter())] == [0, 0, 0]
-    assert list(filter_each([], two_view_filter())) == []
+    assert [len(values) for values in filter_matches(empty, exact_filter())] == [0, 0, 0]
+    assert list(filter_each([], exact_filter())) == []
 
 
 @given(seeds, sizes, st.integers(1, 70), st.sets(st.integers(0, 7)))
@@ -68,10 +67,10 @@ def test_a_stream_gets_the_verdicts_of_each_pair_alone(
     items = [replace(item, cost=None) if b in without_cost else item for b, item in enumerate(items)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(verdicts, "BLOCK_MATCHES", block)
-        results = list(filter_each(enumerate(items), two_view_filter()))
+        results = list(filter_each(enumerate(items), exact_filter()))
     assert [key for key, _ in results] == list(range(len(items)))
     for (_, result), item in zip(results, items, strict=True):
-        assert_same(result, expected_of_any_views(item))
+        assert_same(result, expected_exactly(item))
 
 
 def test_a_stream_is_read_no_further_than_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,14 +82,14 @@ def test_a_stream_is_read_no_further_than_a_block(monkeypatch: pytest.MonkeyPatc
             taken.append(b)
             yield b, item
 
-    stream = filter_each(pairs(), two_view_filter())  # type: ignore[arg-type]
+    stream = filter_each(pairs(), exact_filter())  # type: ignore[arg-type]
     next(stream)
     assert taken == [0, 1, 2]
 
 
 def test_summaries_count_every_match_once() -> None:
     matches = batch(1)
-    result = expected_of_any_views(matches)
+    result = expected_exactly(matches)
     summary = FilterSummary().add(5, result).add(2, result)
     assert summary.num_pairs == 7
     assert summary.num_matches == 2 * matches.num_matches
@@ -114,5 +113,5 @@ def test_spread_and_take_undo_each_other(seed: int, n: int) -> None:
 
 
 def test_the_batch_of_the_tests_has_duplicates_and_all_relations() -> None:
-    result = expected_of_any_views(collate_matches([batch(seed) for seed in range(5)]))
+    result = expected_exactly(collate_matches([batch(seed) for seed in range(5)]))
     assert set(result.relation.tolist()) == {0, 1, 2, 3, 4}

@@ -33,9 +33,13 @@ def make_grid(
     verdicts: Sequence[str] = ("adjacency", "cardinality"),
     scores: Sequence[str] = ("topology",),
     slopes: Sequence[float] = (0.2,),
+    rectified: Sequence[str] = ("true",),
     seeds: Sequence[int] = (0,),
 ) -> list[dict[str, Any]]:
-    """Settings of every trial, by the names of the columns; ``slopes`` are of the score consensus."""
+    """Settings of every trial, by the names of the columns.
+
+    ``slopes`` are of the score consensus, ``rectified`` of this and ``learned``.
+    """
     axes = detectors, ("unconstrained", "constrained"), verdicts, scores, outlier_rates
     return [
         {
@@ -55,6 +59,7 @@ def make_grid(
             "noise_px": 0.0,
             "seed": seed,
             "score": score,
+            "rectified": kind,
             "temperature": 1.0 if score == "topology" else None,
             "temperature_unit": "edge" if score == "topology" else None,
             **consensus_columns(ConsensusConfig(slope=slope) if score == "consensus" else None),
@@ -65,6 +70,7 @@ def make_grid(
         }
         for detector, variant, verdict, score, rate in itertools.product(*axes)
         for slope in (slopes if score == "consensus" else (None,))
+        for kind in (rectified if score in ("learned", "consensus") else (None,))
         for seed in seeds
     ]
 
@@ -138,7 +144,8 @@ def _measure(trial: dict[str, Any], pair: int, seed: int, difficulty: float, gai
     spent |= {"score": 2e-3} if trial["score"] != "none" else {}
     seconds = {stage: spent.get(stage, 0.0) * math.exp(draw.normal(0, 0.2)) for stage in STAGES}
     domain = "" if trial["score"] in ("learned", "consensus") else None
-    return measured | {"domain": domain, "seconds": seconds}
+    is_rectified = None if domain is None else trial["rectified"] != "false"
+    return measured | {"domain": domain, "is_rectified": is_rectified, "seconds": seconds}
 
 
 def make_png() -> bytes:

@@ -125,7 +125,7 @@ def test_what_the_runs_as_a_whole_differ_in_does_not_part_them() -> None:
     assert comparison.trials["trial"].to_list() == comparison.trials["trial_b"].to_list() == list(range(len(other)))
     assert set(comparison.only["detector"]) == {"fast"}
     scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in ("learned", "none")]
-    assert compare_runs(*scores).changed == {"score": ("learned", "none")}
+    assert compare_runs(*scores).changed == {"score": ("learned", "none"), "rectified": ("yes", "–")}
     assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
 
 
@@ -134,7 +134,8 @@ def test_runs_of_two_scores_differ_in_the_settings_of_both() -> None:
     scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in names]
     own = {name: ("–", setting_text(name, value)) for name, value in consensus_columns(ConsensusConfig()).items()}
     assert len(own) == 9
-    changed = {"score": names, "temperature": ("1", "–"), "temperature_unit": ("edge", "–")} | own
+    changed = {"score": names, "rectified": ("–", "yes")}
+    changed |= {"temperature": ("1", "–"), "temperature_unit": ("edge", "–")} | own
     assert compare_runs(*scores).changed == changed
     assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
 

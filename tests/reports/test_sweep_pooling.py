@@ -242,3 +242,23 @@ def test_detectors_come_in_the_order_of_the_paper() -> None:
 def test_every_column_of_settings_has_a_heading() -> None:
     assert set(SETTINGS) == set(setting_columns(TrialConfig()))
     assert set(SETTINGS) <= set(ROW_SCHEMA)
+
+
+def test_rectified_tells_trials_apart() -> None:
+    kinds = ("true", "false", "auto")
+    grid = make_grid(("fast",), verdicts=("score",), scores=("learned", "none"), outlier_rates=(0.0,), rectified=kinds)
+    grid = [point for point in grid if point["score"] == "learned" and point["variant"] == "unconstrained"]
+    results = make_results(grid, num_pairs=2)
+    assert varying_settings([results]) == ["rectified"]
+    assert pool_trials(results)["rectified"].to_list() == list(kinds)
+    rows = results.unique("trial", maintain_order=True).rows(named=True)
+    labels = [settings_label(row, ["score", "rectified"]) for row in rows]
+    assert labels == ["learned, rectified yes", "learned, rectified no", "learned, rectified auto"]
+    (curve,) = detector_curves(results)[0].curves  # the made-up scores are those of one draw
+    assert [row["rectified"] for row in curve.trials] == list(kinds)
+    assert "rectified" not in curve.fixed_settings()
+
+
+def test_rectified_follows_from_a_score_that_does_not_ask() -> None:
+    results = make_results(make_grid(("fast",), scores=("learned", "topology"), outlier_rates=(0.0,)), num_pairs=1)
+    assert "rectified" not in varying_settings([results])

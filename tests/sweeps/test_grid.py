@@ -80,11 +80,18 @@ def test_a_setting_of_consensus_is_an_axis_where_that_is_the_score() -> None:
     ]  # fmt: skip
 
 
-def test_rectified_is_an_axis_where_a_score_asks_for_it(tmp_path: Path) -> None:
-    for text, expected in (("true", [True]), ("false", [False]), ('"auto"', ["auto"]), ('[true, "auto", false]', [True, "auto", False])):
-        config = _read(tmp_path, f"[grid]\nrectified = {text}")
-        assert [trial.rectified for trial in config.trials] == expected
-        assert all(trial.rectified is value for trial, value in zip(config.trials, expected, strict=True))
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("true", [True]), ("false", [False]), ('"auto"', ["auto"]), ('[true, "auto", false]', [True, "auto", False])],
+)
+def test_rectified_is_a_boolean_or_auto(tmp_path: Path, text: str, expected: list[object]) -> None:
+    config = _read(tmp_path, f"[grid]\nrectified = {text}")
+    found = [trial.rectified for trial in config.trials]
+    assert found == expected
+    assert list(map(type, found)) == list(map(type, expected))
+
+
+def test_rectified_is_an_axis_where_a_score_asks_for_it() -> None:
     axis = {"rectified": [False, "auto"], "score": ["none", "topology", "consensus", "learned"]}
     found = expand_grid([axis | {"verdict": "adjacency"}])
     assert [(trial.score, trial.rectified) for trial in found] == [

@@ -218,3 +218,27 @@ def test_pairs_outside_of_the_domain_are_marked_in_the_rows_and_in_the_log(input
     lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     (marked,) = [line for line in lines if line["message"] == "outside of the domain"]
     assert (marked["unit"], marked["scene"], marked["domain"]) == (0, "synthetic-00", ["agreement"])
+
+
+def test_rectified_is_a_setting_and_what_a_pair_was_taken_for_a_result(inputs: Inputs, tmp_path: Path) -> None:
+    settings = tmp_path / "sweep.toml"
+    settings.write_text('[grid]\nscore = ["learned", "consensus"]\nrectified = [true, false, "auto"]\n')
+    config, run = read_grid(settings), tmp_path / "run"
+    assert len(config.trials) == 6
+    assert run_sweep(config, inputs.manifest, run, num_workers=1, limit=1).progress.num_done == 1
+    summary = run_sweep(config, inputs.manifest, run, num_workers=1, limit=1)  # goes on
+    assert (summary.progress.num_done, summary.progress.num_new) == (2, 1)
+    assert read_config(run) == config
+    found = read_results(run)
+    assert len(found) == 2 * 6
+    for row in found.iter_rows(named=True):
+        trial = config.trials[row["trial"]]
+        assert row["rectified"] == str(trial.rectified).lower()
+        assert row["is_rectified"] is (trial.rectified is not False)
+    by_setting = found.group_by("score", "rectified").agg(pl.col("score_counts_correct", "score_counts_incorrect"))
+    for score in ("learned", "consensus"):
+        kinds = ("true", "false", "auto")
+        true, false, auto = (by_setting.filter(score=score, rectified=kind).drop("rectified").rows() for kind in kinds)
+        assert true == auto != false
+    with pytest.raises(ValueError, match=r"rectified is True there, False here"):
+        run_sweep(SweepConfig(tuple(replace(trial, rectified=False) for trial in config.trials)), inputs.manifest, run)

@@ -91,7 +91,7 @@ def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") 
     lines, off_px = fit_lines(points)
     homography, miss_px = fit_homography(points, _MAP_SCALES_PX)
     # the lines hold in the frame of the affine map, and are wanted in that of the homography
-    lines = torch.linalg.inv(homography).transpose(1, 2) @ lines
+    lines = torch.linalg.inv_ex(homography)[0].transpose(1, 2) @ lines
     count = pairs.sum(torch.ones_like(off_px))
     near_lines, near_map = (
         2 * pairs.sum((distance <= limit).double()) >= count

@@ -18,6 +18,12 @@ class MatchGraphs(NamedTuple):
     adjacency1: Adjacency
     group_size: Tensor  # (M,) int64 distinct matches in the same object group, 0 for duplicates, which are no vertices
 
+    @property
+    def patterns(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Row offsets and neighbours of view 0, then of view 1, as operators take them."""
+        zero, one = self.adjacency0, self.adjacency1
+        return zero.crow_indices, zero.col_indices, one.crow_indices, one.col_indices
+
 
 def build_graphs(
     keypoints: Tensor,

@@ -7,8 +7,9 @@
 DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read.
 WORK/rectified and WORK/views receive the putatives of every scene and what the network sees of them (3 GB each), and
 the weights and the figures of the cross-validation. The network of any two views also learns from rectified pairs, seen
-as if nobody had said so, and from the matches that ``learned_matches.py`` leaves in WORK/aliked. Everything follows
-from the seeds below; each training runs on one thread.
+as if nobody had said so, and from the matches that ``learned_matches.py`` leaves in WORK/aliked; the real pairs of any
+two views are left for ``accuracy/any_views.py``. Everything follows from the seeds below; each training runs on one
+thread.
 """
 
 from __future__ import annotations
@@ -47,7 +48,6 @@ from training.platt_scaling import fit_calibration
 from training.putatives import Putatives, find_putatives
 from training.scenes import NUM_FOLDS, Scene, list_scenes
 from training.two_views import find_two_views
-from training.view_scenes import list_view_scenes
 from training.work_folder import fold_weights, items_path, putatives_path
 
 SEED, EPOCHS, PAIRS_AT_ONCE = 0, 30, 8
@@ -272,7 +272,6 @@ def main() -> None:
     if options.kind == VIEWS:
         if missing := [name for name in (RECTIFIED, ALIKED) if not (options.work / name).is_dir()]:
             parser.error(f"work must hold the putatives of {' and '.join(missing)}, got {options.work}")
-        scenes += list_view_scenes(options.training_data)
     numbers = range(len(scenes))
     with multiprocessing.get_context("spawn").Pool(options.processes) as pool:
         start = time.perf_counter()

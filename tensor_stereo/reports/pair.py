@@ -12,7 +12,7 @@ from torch import Tensor
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.classification import verdicts_by_name
 from tensor_stereo.configs import PipelineConfig, describe_settings
-from tensor_stereo.datasets import PairFiles, read_pair
+from tensor_stereo.datasets import PairFiles, read_image, read_pair
 from tensor_stereo.datasets.discovery import find_scale
 from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
 from tensor_stereo.evaluation.metrics import Rates, match_rates
@@ -24,7 +24,7 @@ from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.table_files import write_table
-from tensor_stereo.types import Relation, StereoPair
+from tensor_stereo.types import Relation
 
 Truth = tuple[Tensor, Tensor]  # correct (M,) and valid (M,), bool
 
@@ -73,7 +73,7 @@ def classify_files(
 
     Args:
         left: Image of view 0.
-        right: Image of view 1, of the same size.
+        right: Image of view 1, of the same size if the pair is rectified or has ground truth.
         config: Settings of every step; None means the defaults.
         disparity_gt: Ground truth of view 0, PFM or PNG.
         gt_scale: Stored value / px of disparity in a PNG map; None: the one of the release, if its folders tell it.
@@ -102,19 +102,21 @@ def classify_files(
         raise ValueError(f"gt_scale must be None without disparity_gt in a PNG file, got {gt_scale}")
     if disparity_gt is not None and gt_scale is None:
         gt_scale = find_scale(left, disparity_gt)
-    pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale, sample_bits=sample_bits))
-    output = run_pipeline([(pair.image0, pair.image1)], config)
-    truth = (
-        None
-        if pair.disparity_gt is None
-        else matches_against_gt(output.matches, [pair.disparity_gt], max_error_px=config.max_error_px)
-    )
+    if disparity_gt is None and config.rectified is not True:  # of any sizes
+        images = read_image(left, sample_bits=sample_bits), read_image(right, sample_bits=sample_bits)
+        output, truth = run_pipeline([images], config), None
+    else:
+        pair = read_pair(PairFiles("", left.stem, left, right, disparity_gt, gt_scale, sample_bits=sample_bits))
+        images = pair.image0, pair.image1
+        output, truth = run_pipeline([images], config), None
+        if pair.disparity_gt is not None:
+            truth = matches_against_gt(output.matches, [pair.disparity_gt], max_error_px=config.max_error_px)
     if out is not None:
         table = match_table(output, config, truth)
         with whole_file(out) as part:
             write_table(table, part)
     if figure is not None:
-        write_figure(_draw(pair, output, config, truth), figure)
+        write_figure(_draw(left.stem, images, output, config, truth), figure)
     verdict = output.classification
     num_untested = int((verdict.relation == Relation.UNTESTED).sum())
     num_kept = int(verdict.inlier.sum())
@@ -180,15 +182,16 @@ def _is_rectified(output: PipelineOutput) -> bool | None:
     return None if output.alignment is None else bool(output.alignment.rectified)
 
 
-def _draw(pair: StereoPair, output: PipelineOutput, config: PipelineConfig, truth: Truth | None) -> Figure:
+def _draw(
+    name: str, images: tuple[Tensor, Tensor], output: PipelineOutput, config: PipelineConfig, truth: Truth | None
+) -> Figure:
     correct, valid = truth if truth is not None else (None, None)
-    images = pair.image0, pair.image1
     verdicts = _verdicts(output, config)
     shown = {describe_settings(config): output.classification.inlier}
     if config.verdict == "score":
         shown["cardinality"] = verdicts["cardinality"]
     contours = [trace_objects(to_gray(image[None])[0], config.objects) for image in images if config.constrained]
-    title = f"{pair.name}, {config.detector.upper()}"
+    title = f"{name}, {config.detector.upper()}"
     if config.rectified == "auto" and output.alignment is not None:
         title += ", taken for rectified" if _is_rectified(output) else ", taken for not rectified"
     return draw_classification(

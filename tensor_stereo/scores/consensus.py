@@ -137,10 +137,7 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignm
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
         *_displacements(matches, alignment),
-        graphs.adjacency0.crow_indices,
-        graphs.adjacency0.col_indices,
-        graphs.adjacency1.crow_indices,
-        graphs.adjacency1.col_indices,
+        *graphs.patterns,
         settings.tolerance_px,
         settings.whole_tolerance_px,
         settings.row_tolerance_px,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +14,10 @@ from torch import Tensor
 
 from tensor_stereo import DelaunayFilter, Matches
 from tensor_stereo.batching import collate_matches, select_pairs
+from tensor_stereo.configs import PipelineConfig, SIFTConfig
+from tensor_stereo.datasets import find_pairs, read_pair
 from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.pipeline import run_pipeline
 from tensor_stereo.scores import DomainWarning, measure_images
 from tensor_stereo.scores.alignment import Alignment, align_matches, estimate_alignment
 from tensor_stereo.scores.alignment.form import epipolar_frames, map_points, no_alignment
@@ -293,3 +297,29 @@ def test_a_match_without_lines_is_held_against_a_disc() -> None:
     assert evidence.num_columns.tolist() == [9] * 5
     torch.testing.assert_close(evidence.first, torch.full((5,), -4.0))
     assert evidence.curve0.argmin(2).eq(4).all()  # where the match is
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 0.8])
+def test_auto_takes_rectified_pairs_for_such(wrong: float) -> None:
+    for seed in range(4):
+        pair = relief(seed, wrong)
+        for shift, drift in ((0.0, 0.0), (2.0, 0.0), (-3.0, 0.002)):
+            rows = pair.keypoints1[:, 1] + shift + drift * pair.keypoints0[:, 0]
+            moved = replace(pair, keypoints1=torch.stack([pair.keypoints1[:, 0], rows], 1))
+            assert estimate(moved, "auto").rectified.tolist() == [True]
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize(("degrees", "scale"), [(3.0, 1.0), (180.0, 1.0), (-90.0, 1.0), (0.0, 1.1), (25.0, 0.7)])
+def test_auto_takes_other_pairs_for_such(degrees: float, scale: float, wrong: float) -> None:
+    for seed in range(4):
+        assert estimate(seen_under(turn(degrees, scale), relief(seed, wrong)), "auto").rectified.tolist() == [False]
+
+
+@pytest.mark.parametrize("detector", ["sift", "fast"])
+def test_auto_takes_no_published_pair_for_the_wrong_kind(data_root: Path, detector: str) -> None:
+    config = PipelineConfig(detector=detector, sift=SIFTConfig(backend="opencv"), score="consensus", rectified="auto")
+    for files in find_pairs(data_root):
+        pair = read_pair(files)
+        output = run_pipeline([(pair.image0, pair.image1)], config)
+        assert output.alignment.rectified.all(), files.scene

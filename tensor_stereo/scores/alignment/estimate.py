@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from tensor_stereo import ops
 from tensor_stereo.configs import Backend, Rectified
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.scores.alignment.form import Alignment
-from tensor_stereo.scores.alignment.rows import fit_alignment
+from tensor_stereo.scores.alignment.pair_sums import select_rows
+from tensor_stereo.scores.alignment.rows import FIT_PX, fit_alignment
 from tensor_stereo.scores.alignment.views import fit_views
 from tensor_stereo.types import Matches
 
 _LEAST_VOTES = 3  # of neighbours, counted in each view
+_MAX_SHIFT_PX, _MAX_DEVIATION_PX = 4.0, 1.0  # of the rows of rectified pairs; .7 and .6 are the most in published ones
 _ROW_PX, _DISPARITY_PX, _SLOPE = 1.0, 2.0, 0.2  # how far two neighbours that agree may differ, the last per px of way
 
 
@@ -29,8 +32,9 @@ def estimate_alignment(
     Args:
         matches: B pairs, coordinates in px.
         graphs: The graphs of the same matches.
-        rectified: What the pairs are. ``auto`` takes a pair for rectified if its rows fit, and at least half as many
-            matches agree on them as on a map of any two views; a pair that fits neither is not.
+        rectified: What the pairs are. ``auto`` takes a pair for rectified if most of the matches that agree on a map of
+            any two views lie on rows as well, and these rows lie at most 4 px from where they should in the mean and
+            vary by at most 1 px around that (a standard deviation). A pair that fits neither is not.
         backend: As in :func:`tensor_stereo.classify_matches`.
 
     Returns:
@@ -54,22 +58,30 @@ def estimate_alignment(
     """
     check_match_graphs(matches, graphs)
     if rectified is False:
-        return fit_views(matches, graphs, backend)
-    patterns = [
-        getattr(graph, name)
-        for graph in (graphs.adjacency0, graphs.adjacency1)
-        for name in ("crow_indices", "col_indices")
-    ]
-    tolerances = _ROW_PX, _DISPARITY_PX, _SLOPE, 0.0
-    votes = ops.agreeing_neighbors(matches.keypoints0, matches.keypoints1, *patterns, *tolerances, backend)
+        return fit_views(matches, graphs, backend)[0]
+    limits = _ROW_PX, _DISPARITY_PX, _SLOPE, 0.0
+    votes = ops.agreeing_neighbors(matches.keypoints0, matches.keypoints1, *graphs.patterns, *limits, backend)
     rows = fit_alignment(matches, votes >= _LEAST_VOTES)
     if rectified is True:
         return rows
-    views = fit_views(matches, graphs, backend)
-    takes_rows = rows.fitted & (2 * rows.num_agreeing >= views.num_agreeing)
+    views, agreeing = fit_views(matches, graphs, backend)
+    takes_rows = _lie_on_rows(matches, agreeing)
     return Alignment(
         *(
             torch.where(takes_rows.reshape(-1, *[1] * (one.ndim - 1)), one, other)
             for one, other in zip(rows, views, strict=True)
         )
     )
+
+
+def _lie_on_rows(matches: Matches, agreeing: Tensor) -> Tensor:
+    """(B,) bool, whether most of some matches lie on rows, where those of a rectified pair may be."""
+    rows = fit_alignment(matches, agreeing)
+    shift = rows.row_shift(matches)
+    offset = matches.keypoints1[:, 1].double() - matches.keypoints0[:, 1].double()
+    chosen, pairs = select_rows(matches, agreeing & ((offset - shift).abs() <= FIT_PX))
+    shift = shift.index_select(0, chosen)
+    count = pairs.sum(torch.ones_like(shift)).clamp(min=1)
+    mean = pairs.sum(shift) / count
+    variance = pairs.sum((shift - pairs.spread(mean)).square()) / count
+    return rows.fitted & (mean.abs() <= _MAX_SHIFT_PX) & (variance <= _MAX_DEVIATION_PX**2)

@@ -19,7 +19,7 @@ _SCALES_PX = (6.0, 3.0, 1.5, 0.8, 0.5)  # of the noise, round by round
 _SLOPE_PRIOR, _TILT_PRIOR = 0.02, 0.005  # standard deviations of the drift, and of that with the disparity, px/px
 _LEAST_SHIFT_PX = 0.1  # what is smaller all over the pair is none
 _MAX_DRIFT = 0.05  # px/px; what drifts more is not rectified
-_FIT_PX = 1.5  # most of the matches that agree must lie that near to their rows
+FIT_PX = 1.5  # most of the matches that agree must lie that near to their rows
 
 
 @torch.no_grad()
@@ -62,7 +62,7 @@ def fit_alignment(matches: Matches, agreeing: Tensor) -> Alignment:
         relative = (offset - _at(fit, basis, batch)) / scale_px
         fit = _solve(1 / (1 + relative.square()).square(), basis, offset, scale_px, pairs)
     fitted_offset = _at(fit, basis, batch)
-    near = ((offset - fitted_offset).abs() <= _FIT_PX).to(one)
+    near = ((offset - fitted_offset).abs() <= FIT_PX).to(one)
     is_slow = (fit[:, 1:].abs() <= _MAX_DRIFT).all(1)
     fitted = (count >= LEAST_AGREEING) & is_slow & (2 * pairs.sum(near) >= count)
     largest = torch.zeros_like(count).scatter_reduce(0, batch, fitted_offset.abs(), "amax")

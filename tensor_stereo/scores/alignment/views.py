@@ -54,7 +54,7 @@ class Normalized(NamedTuple):
 
 
 @torch.no_grad()
-def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") -> Alignment:
+def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") -> tuple[Alignment, Tensor]:
     """Fit map and epipolar lines of every pair to the matches that agree with their neighbours.
 
     Args:
@@ -63,14 +63,15 @@ def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") 
         backend: As in :func:`tensor_stereo.classify_matches`.
 
     Returns:
-        The alignment of every pair, none of them rectified. A pair does not depend on the others. No gradient.
+        The alignment of every pair, none of them rectified; and (M,) bool, the matches that agree with their neighbours
+        under it. A pair does not depend on the others. No gradient.
 
     >>> from tensor_stereo.graphs import build_match_graphs
     >>> left = torch.rand(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 400
     >>> half_turn = -left + torch.tensor([500.0, 300.0])
     >>> half_turn[:100] = half_turn[:100].flip(0)
     >>> matches = Matches(left, half_turn, torch.tensor([0, 200]))
-    >>> fit_views(matches, build_match_graphs(matches)).to_view0[0].round(decimals=2).abs()
+    >>> fit_views(matches, build_match_graphs(matches))[0].to_view0[0].round(decimals=2).abs()
     tensor([[  1.,   0., 500.],
             [  0.,   1., 300.],
             [  0.,   0.,   1.]], dtype=torch.float64)
@@ -79,14 +80,16 @@ def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") 
     batch = ptr_to_batch(matches.ptr)
     affine = find_similarity(matches, graphs)
     for k, (near_px, spread, scales_px) in enumerate(_ROUNDS):
-        rows, pairs = _agreeing(matches, map_points(affine, right, batch), graphs, near_px, spread, backend)
+        agreeing = _agree(matches, map_points(affine, right, batch), graphs, near_px, spread, backend)
+        rows, pairs = select_rows(matches, agreeing)
         partners = map_points(affine, right.index_select(0, rows), pairs.batch)
         if k == 0:
             affine = _shift(_median(left.index_select(0, rows) - partners, pairs)) @ affine
             partners = map_points(affine, right.index_select(0, rows), pairs.batch)
         points = normalize(left.index_select(0, rows), partners, pairs)
         affine = fit_affine(points, scales_px) @ affine
-    rows, pairs = _agreeing(matches, map_points(affine, right, batch), graphs, _LAST_PX, _LAST_SPREAD, backend)
+    agreeing = _agree(matches, map_points(affine, right, batch), graphs, _LAST_PX, _LAST_SPREAD, backend)
+    rows, pairs = select_rows(matches, agreeing)
     points = normalize(left.index_select(0, rows), map_points(affine, right.index_select(0, rows), pairs.batch), pairs)
     lines, off_px = fit_lines(points)
     homography, miss_px = fit_homography(points, _MAP_SCALES_PX)
@@ -100,12 +103,13 @@ def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") 
     has_lines = near_lines & (count >= _LEAST_LINES)
     fitted = (count >= LEAST_AGREEING) & (has_lines | near_map)
     none = no_alignment(matches.num_pairs, left, rectified=False)
-    return none._replace(
+    found = none._replace(
         to_view0=torch.where(fitted[:, None, None], homography @ affine, none.to_view0),
         lines=torch.where((fitted & has_lines)[:, None, None], lines, 0),
         fitted=fitted,
         num_agreeing=count.long(),
     )
+    return found, agreeing
 
 
 def find_similarity(matches: Matches, graphs: MatchGraphs) -> Tensor:
@@ -261,19 +265,17 @@ def _least_eigenvector(moments: Tensor) -> Tensor:
     trace = moments.diagonal(dim1=1, dim2=2).sum(1)
     beyond = functional.pad(moments.new_zeros(9), (0, 7), value=1.0) * (1 + 2 * trace[:, None])
     whole = functional.pad(moments, (0, 7, 0, 7)) + torch.diag_embed(beyond)
-    return torch.linalg.eigh(whole).eigenvectors[:, :9, 0]
+    vectors: Tensor = torch.linalg.eigh(whole).eigenvectors
+    return vectors[:, :9, 0]
 
 
-def _agreeing(
+def _agree(
     matches: Matches, partners: Tensor, graphs: MatchGraphs, near_px: float, spread: float, backend: Backend
-) -> tuple[Tensor, PairSums]:
-    patterns = [
-        getattr(graph, name)
-        for graph in (graphs.adjacency0, graphs.adjacency1)
-        for name in ("crow_indices", "col_indices")
-    ]
-    votes = ops.agreeing_neighbors(matches.keypoints0, partners, *patterns, near_px, near_px, 0.0, spread, backend)
-    return select_rows(matches, votes >= _LEAST_VOTES)
+) -> Tensor:
+    """(M,) bool, whether some neighbours move as a match does, under a map of view 1."""
+    limits = near_px, near_px, 0.0, spread
+    votes = ops.agreeing_neighbors(matches.keypoints0, partners, *graphs.patterns, *limits, backend)
+    return votes >= _LEAST_VOTES
 
 
 def _say(relative: Tensor) -> Tensor:

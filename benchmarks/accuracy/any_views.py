@@ -9,7 +9,6 @@ and LightGlue, which take some seconds a pair.
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +38,7 @@ from accuracy.putatives import (
 )
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
+from training.putatives import Putatives as TrainingPutatives
 from training.two_views import find_two_views
 from training.view_scenes import list_view_scenes
 
@@ -139,14 +139,32 @@ def report_auto(suite: Suite, groups: dict[str, list[GrayPair]]) -> None:
                 taken = [_is_taken_for_rectified(to_matches([one])) for one in found]
                 title = f"auto, {group}, {detector}{' g' if gated else ''}"
                 suite.note(title, pairs=len(found), taken_for_rectified=sum(taken))
-    taken = Counter()
+
+
+def report_real_views(suite: Suite) -> None:
+    """The two real pairs that are not rectified, which training never saw, and alterations of them."""
     for number, scene in enumerate(list_view_scenes(suite.options.training_data)):
-        for one in find_two_views(scene, number):
-            taken[one.scene] += 1
-            taken[f"{one.scene}, rectified"] += _is_taken_for_rectified(one.matches)
-        suite.note(
-            f"auto, {scene.name}", pairs=taken[scene.name], taken_for_rectified=taken[f"{scene.name}, rectified"]
-        )
+        found = find_two_views(scene, number)
+        taken = [_is_taken_for_rectified(one.matches) for one in found]
+        suite.note(f"auto, {scene.name}", pairs=len(found), taken_for_rectified=sum(taken))
+        for k, tolerance in enumerate(TOLERANCES_PX):
+            merits = _merits_of_views(found, k) if tolerance >= found[0].least_error_px else {}
+            for name, values in merits.items():
+                suite.note(f"{scene.name}, {name}, {tolerance:g} px", auc=np.mean(values), pairs=len(values))
+
+
+def _merits_of_views(found: list[TrainingPutatives], k: int) -> dict[str, list[float]]:
+    """AUC of every pair that has correct and incorrect matches at tolerance k, by score."""
+    merits: dict[str, list[float]] = {}
+    for one in found:
+        known, correct = ~one.error_px.isnan(), one.error_px <= TOLERANCES_PX[k]
+        if not 0 < int(correct.sum()) < int(known.sum()):
+            continue
+        for name in ("consensus", "learned"):
+            images = None if name == "consensus" else tuple([image] for image in one.images)
+            score = score_matches(one.matches, FilterConfig(score=name, rectified="auto"), images=images)
+            merits.setdefault(name, []).append(roc_update(score.cumulative[:, k], correct, valid=known).auc())
+    return merits
 
 
 def _is_taken_for_rectified(matches) -> bool:
@@ -173,6 +191,7 @@ def main() -> None:
     report_turned(suite, groups["eight"])
     more = load_pairs(suite.options.training_data)
     report_auto(suite, {name: pairs + (more[name] if name != "synthetic" else []) for name, pairs in groups.items()})
+    report_real_views(suite)
     suite.write()
 
 

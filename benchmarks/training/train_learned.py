@@ -269,9 +269,9 @@ def main() -> None:
     folder = options.work / options.kind
     folder.mkdir(parents=True, exist_ok=True)
     scenes = list_scenes(options.data, options.training_data)
-    if options.kind == VIEWS:
-        if missing := [name for name in (RECTIFIED, ALIKED) if not (options.work / name).is_dir()]:
-            parser.error(f"work must hold the putatives of {' and '.join(missing)}, got {options.work}")
+    missing = [name for name in (RECTIFIED, ALIKED) if not (options.work / name).is_dir()]
+    if options.kind == VIEWS and missing:
+        parser.error(f"work must hold the putatives of {' and '.join(missing)}, got {options.work}")
     numbers = range(len(scenes))
     with multiprocessing.get_context("spawn").Pool(options.processes) as pool:
         start = time.perf_counter()

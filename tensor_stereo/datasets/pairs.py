@@ -61,7 +61,7 @@ def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
     image0, image1 = (image.expand(channels, -1, -1).contiguous() for image in (image0, image1))
     if image0.shape != image1.shape:
         shapes = f"{files.image0} has {tuple(image0.shape)}, {files.image1} has {tuple(image1.shape)}"
-        raise ValueError(f"both views must have one shape (C, H, W): {shapes}")
+        raise ValueError(f"both views of a rectified pair must have one shape (C, H, W): {shapes}")
     disparity = None if files.disparity_gt is None else _read_disparity(files, files.disparity_gt, gt_scale)
     occluded = None if disparity is None else _read_occluded(files, disparity, gt_scale)
     for path, values in ((files.disparity_gt, disparity), (files.mask or files.disparity_noc_gt, occluded)):

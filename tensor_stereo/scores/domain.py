@@ -13,7 +13,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import FilterConfig
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.relations import shared_neighbors
-from tensor_stereo.scores.alignment import Alignment, align_matches
+from tensor_stereo.scores.alignment.form import Alignment, align_matches, epipolar_frames
 from tensor_stereo.types import Matches
 
 MAX_PX = 2.0**24  # beyond it float32 does not tell neighbouring pixels apart
@@ -22,6 +22,7 @@ _LEAST_MATCHES = 8  # fewer say nothing about their pair
 _LEAST_TOLD = 32  # tested matches of a pair from which on a warning says that they do not agree; few seldom do
 _SHARED = 3  # neighbours in both views that make a match one that agrees,
 _LEAST_GROUP = 16  # in a group of at least so many: small ones are almost complete graphs, and agree by themselves
+_MOST_SPREAD = 0.15  # of the directions of epipolar lines, one less the length of their mean
 _MAX_ROW_SHIFT_PX = 0.75  # median of y0 - y1 over the matches that agree
 _MAX_ROW_OFFSET_PX = 2.0  # median of |y0 - y1| over them; a rotated view has offsets of both signs
 
@@ -37,9 +38,10 @@ class Domain(IntFlag):
     AGREEMENT = 2  # fewer than 12 matches agree with their neighbours, so that no alignment is known
     ROWS = 4  # those that agree lie off their rows, or epipolar lines, in a way that nothing that all share explains
     IMAGES = 8  # more than a tenth of the keypoints of a view lie outside of its image
+    EPIPOLE = 16  # epipolar lines meet among the keypoints, as where a camera moves forward; probabilities are too low
 
 
-_SPAN, _AGREEMENT, _ROWS, _IMAGES = map(int, Domain)  # a compiler knows no enumeration
+_SPAN, _AGREEMENT, _ROWS, _IMAGES, _EPIPOLE = map(int, Domain)  # a compiler knows no enumeration
 
 
 class DomainWarning(UserWarning):
@@ -71,7 +73,7 @@ def check_domain(
         config: Its score is ``consensus`` or ``learned``.
 
     Returns:
-        (B,) int8, values of :class:`Domain`: ``SPAN``, ``AGREEMENT`` and ``ROWS``. No gradient.
+        (B,) int8, values of :class:`Domain`, all but ``IMAGES``. No gradient.
 
     Raises:
         ValueError: for coordinates beyond 2**24 px, where single precision has no whole pixels.
@@ -82,10 +84,13 @@ def check_domain(
     with torch.no_grad():
         batch = ptr_to_batch(matches.ptr)
         small = _spans(matches, batch) < _LEAST_SPAN_PX
-        off = few = told = torch.zeros_like(small)
+        off = few = told = meet = torch.zeros_like(small)
         if alignment is not None:
             off = _off_their_rows(align_matches(matches, alignment), graphs, batch, config) & alignment.has_rows
             off |= alignment.unfit
+            if torch.compiler.is_compiling() or not bool(alignment.rectified.all()):
+                spread = epipolar_frames(matches, alignment).spread
+                meet = alignment.has_rows & ~alignment.rectified & (spread > _MOST_SPREAD)
             few = ~alignment.fitted & ~off & (matches.ptr.diff() > 0)
             told = few & (_count(graphs.group_size >= config.min_group_size, batch, matches) >= _LEAST_TOLD)
     if not torch.compiler.is_compiling():
@@ -108,11 +113,17 @@ def check_domain(
             "with their neighbours, but those of {pairs} have none in common",
         )
         _warn(
+            meet,
+            "the score expects epipolar lines that meet far away, but those of {pairs} meet among the keypoints, as "
+            "where a camera moves forward; its ranking holds, its probabilities are too low",
+        )
+        _warn(
             told,
             "the score expects matches that agree with their neighbours, but those of {pairs} hardly do, so their "
             "probabilities may be far off; check that row i of both views is one match",
         )
-    return small.to(torch.int8) * _SPAN + few.to(torch.int8) * _AGREEMENT + off.to(torch.int8) * _ROWS
+    marks = ((small, _SPAN), (few, _AGREEMENT), (off, _ROWS), (meet, _EPIPOLE))
+    return torch.stack([holds.to(torch.int8) * mark for holds, mark in marks]).sum(0, dtype=torch.int8)
 
 
 def check_images(matches: Matches, images: tuple[Sequence[Tensor], Sequence[Tensor]]) -> Tensor:

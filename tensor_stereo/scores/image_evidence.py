@@ -1,7 +1,8 @@
 """Local image evidence for putative matches: does another place on the row explain the window better?
 
-Windows around both keypoints of a match are held against the row of the other view, over a range of disparities that
-follows from the matches themselves, and near the match once more along the slope of its surface. The measure is the
+Windows around both keypoints of a match are held against the row of the other view, or against the epipolar line of
+views that are not rectified, over a range of disparities that follows from the matches themselves, and near the match
+once more along the slope of its surface. The measure is the
 logarithm of the zero-mean sum of squared differences: but for a constant, the negative log-likelihood per degree of
 freedom of Gaussian noise of unknown variance.
 """

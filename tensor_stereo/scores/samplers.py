@@ -19,6 +19,8 @@ from tensor_stereo.types import Matches
 
 _LEAST_BLUR_PX = 0.2  # less is none
 _WIDEST = 1.0  # of the size of view 0, how far view 1 may lie beyond it
+_MARGIN = 2 * RADIUS_PX  # px around what is known
+_ROWS_AT_ONCE = 256
 
 
 class Place(NamedTuple):
@@ -110,17 +112,21 @@ class LineSampler(NamedTuple):
     known: Tensor  # (H, W) bool
 
     def windows(self, centers: Tensor, radius_x: int) -> Tensor:
+        """(m, 15, 2 rx + 1) grey levels around centres (m, 2) px, along the lines."""
         return self._sample(centers, radius_x, self._axes())
 
     def strips(self, start: Tensor, width: int) -> Tensor:
+        """(m, 15, width) grey levels of strips along the lines from ``start`` (m, 2) px on."""
         offsets = torch.arange(width, device=start.device, dtype=torch.float32)
         return sample_frames(self.image, start - self.origin, self._axes(), offsets)
 
     def slanted(self, centers: Tensor, radius_x: int, shear: Tensor) -> Tensor:
+        """(m, 15, 2 rx + 1) grey levels of what a slanted surface moves there."""
         u, v = self._axes().unbind(1)  # along and across
         return self._sample(centers, radius_x, torch.stack([u * (1 + shear[:, :1]), v + u * shear[:, 1:]], 1))
 
     def outside(self, start: Tensor, count: int) -> Tensor:
+        """(m, count) bool, which places from ``start`` on along the lines are not known."""
         steps = torch.arange(count, device=start.device, dtype=torch.float32)
         points = ((start - self.origin)[:, None] + steps[:, None] * self.along[:, None]).round().long()
         size = points.new_tensor([self.known.shape[1], self.known.shape[0]])
@@ -129,9 +135,11 @@ class LineSampler(NamedTuple):
         return ~inside | ~self.known[y, x]
 
     def select(self, rows: slice) -> LineSampler:
+        """That of some matches."""
         return self._replace(along=self.along[rows])
 
     def place(self, points: Tensor, along: Tensor, across: Tensor) -> Tensor:
+        """(m, 2) px, points moved along and across the lines."""
         u, v = self._axes().unbind(1)
         return points + along[:, None] * u + across[:, None] * v
 
@@ -182,32 +190,39 @@ def warp_view(image0: Tensor, image1: Tensor, to_view0: Tensor, keypoints1: Tens
 
     >>> image = torch.rand(20, 30)
     >>> warped = warp_view(image, image, torch.eye(3, dtype=torch.float64), torch.tensor([[3.0, 4.0]]))
-    >>> torch.allclose(warped.image1[7:-7, 7:-7], image[:, :], atol=1e-5)
-    False
+    >>> left, top = (-warped.origin).long().tolist()
+    >>> torch.allclose(warped.image1[top : top + 20, left : left + 30], image, atol=1e-5)
+    True
     """
-    partners = map_points(to_view0[None], keypoints1.double(), torch.zeros_like(keypoints1[:, 0], dtype=torch.int64))
+    none = torch.zeros_like(keypoints1[:, 0], dtype=torch.int64)
+    partners = map_points(to_view0[None], keypoints1.double(), none)
+    rows, columns = image1.shape
+    last = partners.new_tensor([columns - 1, rows - 1])
+    corners = map_points(
+        to_view0[None], last * partners.new_tensor([[0, 0], [0, 1], [1, 0], [1, 1]]), none.new_zeros(4)
+    )
     size = partners.new_tensor([image0.shape[1], image0.shape[0]])
-    margin = 2 * RADIUS_PX
-    low = torch.cat([partners, torch.zeros_like(size)[None]]).amin(0).clamp(min=-_WIDEST * size) - margin
-    high = torch.cat([partners, size[None]]).amax(0).clamp(max=(1 + _WIDEST) * size) + margin
+    low = torch.cat([partners, torch.zeros_like(size)[None]]).amin(0).clamp(min=-_WIDEST * size)
+    high = torch.cat([partners, size[None]]).amax(0).clamp(max=(1 + _WIDEST) * size)
+    low = torch.maximum(low, corners.amin(0)).minimum(high) - _MARGIN  # beyond its corners nothing is known
+    high = torch.minimum(high, corners.amax(0)).maximum(low) + _MARGIN
     origin = low.floor()
-    width, height = (high - origin).ceil().long().tolist()
+    width, height = (high - origin).ceil().clamp(min=1).long().tolist()
     finer = _finer(to_view0, keypoints1)
     image0, image1 = _blur(image0, 1 / finer), _blur(image1, finer)
-    x = torch.arange(width, dtype=torch.float64, device=origin.device) + origin[0]
-    y = torch.arange(height, dtype=torch.float64, device=origin.device) + origin[1]
-    grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], 2).reshape(-1, 2)
     m = torch.linalg.inv_ex(to_view0)[0]
-    depth = grid @ m[2, :2] + m[2, 2]
-    source = (grid @ m[:2, :2].t() + m[:2, 2]) / depth[:, None]
-    rows, columns = image1.shape
-    last = source.new_tensor([columns - 1, rows - 1])
-    known = ((source >= 0) & (source <= last)).all(1) & (depth > 0)
-    scaled = (2 * source / last.clamp(min=1) - 1).clamp(-2, 2).nan_to_num(nan=2.0)
-    warped = functional.grid_sample(
-        image1[None, None].float(), scaled.reshape(1, height, width, 2).float(), "bicubic", "border", True
-    )
-    return WarpedView(image0, warped[0, 0], known.reshape(height, width), origin.float())
+    x = torch.arange(width, dtype=torch.float64, device=origin.device) + origin[0]
+    parts = []
+    for top in range(0, height, _ROWS_AT_ONCE):  # of a large image, coordinates take eight times its memory
+        y = torch.arange(top, min(top + _ROWS_AT_ONCE, height), dtype=torch.float64, device=origin.device) + origin[1]
+        u, v, depth = (m[k, 0] * x + (m[k, 1] * y + m[k, 2])[:, None] for k in range(3))
+        source = torch.stack([u / depth, v / depth], 2)
+        known = ((source >= 0) & (source <= last)).all(2) & (depth > 0)
+        scaled = (2 * source / last.clamp(min=1) - 1).clamp(-2, 2).nan_to_num(nan=2.0).float()
+        warped = functional.grid_sample(image1[None, None].float(), scaled[None], "bicubic", "border", True)
+        parts.append((warped[0, 0], known))
+    image1, known = (torch.cat(part) for part in zip(*parts, strict=True))
+    return WarpedView(image0, image1, known, origin.float())
 
 
 def _finer(to_view0: Tensor, keypoints1: Tensor) -> float:

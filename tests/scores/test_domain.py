@@ -192,7 +192,9 @@ def test_a_pair_may_have_several_reasons() -> None:
     }
     assert output.domain.tolist() == [Domain.AGREEMENT | Domain.IMAGES]
     assert describe_domain(int(output.domain)) == "agreement, images"
-    assert [describe_domain(reason) for reason in (0, *Domain)] == ["", "span", "agreement", "rows", "images"]
+    assert [describe_domain(reason) for reason in (0, *Domain)] == [
+        *("", "span", "agreement", "rows", "images", "epipole")
+    ]
 
 
 def test_images_are_checked_pair_by_pair() -> None:

@@ -123,6 +123,9 @@ def test_lines_may_meet_in_the_image() -> None:
     found = estimate(matches)
     assert found.has_rows.all()
     frames = epipolar_frames(matches, found)
+    assert frames.spread > 0.8
+    with pytest.warns(DomainWarning, match="meet among the keypoints"):
+        assert DelaunayFilter(rectified=False)(matches).domain.tolist() == [Domain.EPIPOLE]
     assert frames.moved[150:, 1].abs().median() < 0.2
     outward = left - middle
     far = torch.hypot(*outward.unbind(1)) > 60
@@ -323,3 +326,29 @@ def test_auto_takes_no_published_pair_for_the_wrong_kind(data_root: Path, detect
         pair = read_pair(files)
         output = run_pipeline([(pair.image0, pair.image1)], config)
         assert output.alignment.rectified.all(), files.scene
+
+
+def test_auto_asks_for_disparities_that_agree_as_well() -> None:
+    left = random(600, 3) * SIZE
+    for right_x in (SIZE[0] - left[:, 0], 2 * left[:, 0], left[:, 0] + left[:, 1]):
+        matches = Matches(left, torch.stack([right_x, left[:, 1]], 1), torch.tensor([0, 600]))
+        assert estimate(matches, "auto").rectified.tolist() == [False]
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(20, 0.6), (40, 0.8), (160, 0.8)])
+def test_auto_takes_few_matches_on_rows_for_a_rectified_pair(count: int, wrong: float) -> None:
+    for seed in range(6):
+        pair = relief(seed, wrong, count)
+        assert estimate(pair, "auto").rectified.tolist() == [True]
+        assert estimate(seen_under(turn(40, 1.2), pair), "auto").rectified.tolist() == [False]
+
+
+def test_view_1_is_resampled_where_it_is_known_alone() -> None:
+    """Keypoints that a wrong match takes far away do not make the image larger than view 1 is in view 0."""
+    from tensor_stereo.scores.samplers import warp_view
+
+    image = torch.rand(40, 60)
+    far = torch.tensor([[0.0, 0.0], [59.0, 39.0], [900.0, 700.0], [-800.0, -500.0]])
+    warped = warp_view(image, image, torch.eye(3, dtype=torch.float64), far)
+    assert warped.image1.shape <= (40 + 2 * 14 + 1, 60 + 2 * 14 + 1)
+    assert warped.known1.sum() == 40 * 60

@@ -11,6 +11,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.types import Matches
 
 LEAST_AGREEING = 12  # matches that a fit needs
+LEAST_VOTES = 3  # of neighbours that agree with one of them, counted in each view
 _NOWHERE = 1e-12  # shorter normals of lines have no direction
 _LEAST_DEPTH = 1e-3  # of the denominator of a homography; what lies beyond its horizon stays finite
 
@@ -75,12 +76,15 @@ class EpipolarFrames(NamedTuple):
         moved: (M, 2) float64 px, how far partners lie from their keypoints, along the line and off it; along columns
             and rows without lines. Gradients flow to the keypoints.
         turn: (B, 2) float64 unit vector, the mean of ``along``; a constant.
+        spread: (B,) float64 in [0, 1], one less the length of the mean of ``along``: 0 where lines are parallel, and
+            from about .15 on where they meet among the keypoints.
     """
 
     partners: Tensor
     along: Tensor
     moved: Tensor
     turn: Tensor
+    spread: Tensor
 
 
 def epipolar_frames(matches: Matches, alignment: Alignment) -> EpipolarFrames:
@@ -99,20 +103,21 @@ def epipolar_frames(matches: Matches, alignment: Alignment) -> EpipolarFrames:
     x, y = left.detach().unbind(1)
     lines = alignment.lines.reshape(-1, 9).t().contiguous().index_select(1, batch).unbind(0)
     normal_x, normal_y, constant = (lines[k] * x + lines[k + 1] * y + lines[k + 2] for k in (0, 3, 6))
-    length = torch.hypot(normal_x, normal_y)
+    length = (normal_x.square() + normal_y.square()).sqrt()  # of the same bits in any batch, unlike hypot
     has_line = length > _NOWHERE
     safe = torch.where(has_line, length, 1)
     along = torch.where(has_line[:, None], torch.stack([normal_y, -normal_x], 1) / safe[:, None], _right(x)[None])
     turn = torch.stack([_sum(values, batch, matches.num_pairs) for values in along.unbind(1)], 1)
     flip = torch.where((turn[:, 0] < 0) | ((turn[:, 0] == 0) & (turn[:, 1] < 0)), -1.0, 1.0)
-    length = torch.hypot(*turn.unbind(1))[:, None]
+    length = turn.square().sum(1, keepdim=True).sqrt()
+    spread = 1 - length[:, 0] / matches.ptr.diff().clamp(min=1)
     turn = torch.where(length > _NOWHERE, turn * flip[:, None] / length.clamp(min=_NOWHERE), _right(x)[None])
     flip = flip.index_select(0, batch)
     moved = _turn(partners - left, along * flip[:, None])
     u, v = partners.detach().unbind(1)
     off = torch.where(has_line, (normal_x * u + normal_y * v + constant) / safe * flip, moved[:, 1])
     moved = moved + torch.stack([torch.zeros_like(off), (off - moved[:, 1]).detach()], 1)
-    return EpipolarFrames(partners, along * flip[:, None], moved, turn)
+    return EpipolarFrames(partners, along * flip[:, None], moved, turn, spread)
 
 
 def align_matches(matches: Matches, alignment: Alignment) -> Matches:

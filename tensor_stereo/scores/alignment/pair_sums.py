@@ -34,6 +34,15 @@ class PairSums(NamedTuple):
         return values.index_select(0, self.batch)
 
 
+def say(relative: Tensor) -> Tensor:
+    """The weights of Geman & McClure (1987) in a fit, of residuals over their scale.
+
+    >>> say(torch.tensor([0.0, 1.0]))
+    tensor([1.0000, 0.2500])
+    """
+    return 1 / (1 + relative.square()).square()
+
+
 def select_rows(matches: Matches, chosen: Tensor) -> tuple[Tensor, PairSums]:
     """The rows (K,) where a (M,) mask holds, and the pairs that they belong to.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tensor_stereo.scores.alignment.form import LEAST_AGREEING, Alignment, no_alignment
-from tensor_stereo.scores.alignment.pair_sums import PairSums, select_rows
+from tensor_stereo.scores.alignment.pair_sums import PairSums, say, select_rows
 from tensor_stereo.types import Matches, check_mask, check_vector
 
 _MAX_OFFSET_PX, _BIN_PX = 256, 2  # the first guess of the offset is the middle of the fullest bins
@@ -59,8 +59,7 @@ def fit_alignment(matches: Matches, agreeing: Tensor) -> Alignment:
     basis = [one, *(values - mean for values, mean in zip(given, middle.index_select(0, batch).unbind(1), strict=True))]
     fit = functional.pad(_fullest(offset, one, batch, matches.num_pairs)[:, None], (0, 3))  # (B, 4)
     for scale_px in _SCALES_PX:
-        relative = (offset - _at(fit, basis, batch)) / scale_px
-        fit = _solve(1 / (1 + relative.square()).square(), basis, offset, scale_px, pairs)
+        fit = _solve(say((offset - _at(fit, basis, batch)) / scale_px), basis, offset, scale_px, pairs)
     fitted_offset = _at(fit, basis, batch)
     near = ((offset - fitted_offset).abs() <= FIT_PX).to(one)
     is_slow = (fit[:, 1:].abs() <= _MAX_DRIFT).all(1)

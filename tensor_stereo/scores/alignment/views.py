@@ -19,14 +19,13 @@ from tensor_stereo import ops
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import Backend
 from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.scores.alignment.form import LEAST_AGREEING, Alignment, map_points, no_alignment
-from tensor_stereo.scores.alignment.pair_sums import PairSums, select_rows
+from tensor_stereo.scores.alignment.form import LEAST_AGREEING, LEAST_VOTES, Alignment, map_points, no_alignment
+from tensor_stereo.scores.alignment.pair_sums import PairSums, say, select_rows
 from tensor_stereo.types import Matches
 
 _NUM_SCALES, _NUM_ANGLES = 16, 36  # bins of the scale, from a quarter to four, and of the rotation
 _MAX_LOG = math.log(4.0)
 _WIDTHS = ((0.3, 0.35), (0.2, 0.25))  # of log scale and angle around the fullest bins, round by round
-_LEAST_VOTES = 3  # of neighbours, counted in each view
 _ROUNDS = (  # how far neighbours that agree may differ, px and px per px; scales of the fit of the affine map, px
     (2.0, 0.35, (64.0, 32.0, 16.0, 8.0)),
     (2.0, 0.25, (16.0, 8.0, 4.0)),
@@ -56,6 +55,8 @@ class Normalized(NamedTuple):
 @torch.no_grad()
 def fit_views(matches: Matches, graphs: MatchGraphs, backend: Backend = "auto") -> tuple[Alignment, Tensor]:
     """Fit map and epipolar lines of every pair to the matches that agree with their neighbours.
+
+    Scales from a quarter to four are found, and any rotation; a view in a mirror is not.
 
     Args:
         matches: B pairs of any two views, coordinates in px.
@@ -150,7 +151,7 @@ def find_similarity(matches: Matches, graphs: MatchGraphs) -> Tensor:
     for width_log, width_angle in _WIDTHS:
         off_log = log_scale - mean_log.index_select(0, batch)
         off_angle = torch.remainder(angle - mean_angle.index_select(0, batch) + math.pi, 2 * math.pi) - math.pi
-        weight = usable / (1 + (off_log / width_log).square() + (off_angle / width_angle).square()).square()
+        weight = usable * say(((off_log / width_log).square() + (off_angle / width_angle).square()).sqrt())
         total, log_part, angle_part = (
             usable.new_zeros(num_pairs).index_add(0, batch, values)
             for values in (weight, weight * off_log, weight * off_angle)
@@ -192,7 +193,7 @@ def fit_affine(points: Normalized, scales_px: tuple[float, ...]) -> Tensor:
     for k, scale_px in enumerate(scales_px):
         if k:
             miss = [t - sum(pairs.spread(fit[:, m, n]) * b for m, b in enumerate(basis)) for n, t in enumerate(targets)]
-            weight = _say(torch.hypot(*miss) * pairs.spread(points.size) / scale_px)
+            weight = say((miss[0].square() + miss[1].square()).sqrt() * pairs.spread(points.size) / scale_px)
         ridge = (scale_px / points.size / _LINEAR_PRIOR).square()
         normal = _gram(weight, basis, pairs)
         normal = normal + torch.diag_embed(torch.stack([ridge, ridge, torch.full_like(ridge, 1e-9)], 1))
@@ -211,7 +212,7 @@ def fit_homography(points: Normalized, scales_px: tuple[float, ...]) -> tuple[Te
     for scale_px in scales_px:
         g, h = (pairs.spread(found[:, 2, k]) for k in (0, 1))
         depth = (1 + g * x + h * y).clamp(min=0.2)
-        weight = _say(_miss_px(found, points) / scale_px)
+        weight = say(_miss_px(found, points) / scale_px)
         equations = (
             (x, y, one, zero, zero, zero, -u * x, -u * y),
             (zero, zero, zero, x, y, one, -v * x, -v * y),
@@ -240,13 +241,14 @@ def fit_lines(points: Normalized) -> tuple[Tensor, Tensor]:
     pairs = points.pairs
     left, right = (functional.pad(view, (0, 1), value=1.0).unbind(1) for view in (points.left, points.right))
     products = [r * p for r in right for p in left]
+    squares = torch.stack([products[k] * products[m] for k in range(9) for m in range(k, 9)], 1)
     parallel = products[0].new_tensor([1.0, 1, 0, 1, 1, 0, 0, 0, 0])  # what is zero of them
     weight = torch.full_like(products[0], 0.5)
     lines, off_px = weight.new_zeros(len(points.size), 9), weight
     rounds = [(scale, _AFFINE) for scale in _LINE_SCALES_PX] + [(scale, _FREE) for scale in _FREE_SCALES_PX]
     for scale_px, prior in rounds:
         ridge = prior * (scale_px / points.size).square()[:, None] * parallel
-        moments = _gram(weight, products, pairs) + torch.diag_embed(ridge)
+        moments = _symmetric(pairs.sum(weight[:, None] * squares), 9) + torch.diag_embed(ridge)
         lines = _least_eigenvector(moments)
         f = [pairs.spread(lines[:, k]) for k in range(9)]
         ahead = [f[k] * left[0] + f[k + 1] * left[1] + f[k + 2] * left[2] for k in (0, 3, 6)]
@@ -254,7 +256,7 @@ def fit_lines(points: Normalized) -> tuple[Tensor, Tensor]:
         gradient = (ahead[0].square() + ahead[1].square() + back[0].square() + back[1].square()).clamp(min=1e-12)
         residual = right[0] * ahead[0] + right[1] * ahead[1] + right[2] * ahead[2]
         off_px = residual.abs() / gradient.sqrt() * pairs.spread(points.size)
-        weight = _say(off_px / scale_px) / gradient
+        weight = say(off_px / scale_px) / gradient
     fundamental = points.to_normal.transpose(1, 2) @ lines.reshape(-1, 3, 3) @ points.to_normal
     return fundamental, off_px
 
@@ -275,17 +277,12 @@ def _agree(
     """(M,) bool, whether some neighbours move as a match does, under a map of view 1."""
     limits = near_px, near_px, 0.0, spread
     votes = ops.agreeing_neighbors(matches.keypoints0, partners, *graphs.patterns, *limits, backend)
-    return votes >= _LEAST_VOTES
-
-
-def _say(relative: Tensor) -> Tensor:
-    """The weights of Geman & McClure (1987)."""
-    return 1 / (1 + relative.square()).square()
+    return votes >= LEAST_VOTES
 
 
 def _miss_px(homography: Tensor, points: Normalized) -> Tensor:
     miss = map_points(homography, points.right, points.pairs.batch) - points.left
-    return torch.hypot(*miss.unbind(1)) * points.pairs.spread(points.size)
+    return miss.square().sum(1).sqrt() * points.pairs.spread(points.size)
 
 
 def _gram(weight: Tensor, columns: Sequence[Tensor], pairs: PairSums) -> Tensor:
@@ -293,6 +290,11 @@ def _gram(weight: Tensor, columns: Sequence[Tensor], pairs: PairSums) -> Tensor:
     size = len(columns)
     weighted = [weight * column for column in columns]
     upper = pairs.sum(torch.stack([weighted[k] * columns[m] for k in range(size) for m in range(k, size)], 1))
+    return _symmetric(upper, size)
+
+
+def _symmetric(upper: Tensor, size: int) -> Tensor:
+    """(B, C, C) matrices of their upper triangles (B, C (C + 1) / 2), row by row."""
     place = [min(k, m) * (2 * size - min(k, m) - 1) // 2 + max(k, m) for k in range(size) for m in range(size)]
     return upper[:, place].reshape(-1, size, size)
 

@@ -330,7 +330,7 @@ def test_auto_takes_no_published_pair_for_the_wrong_kind(data_root: Path, detect
 
 def test_auto_asks_for_disparities_that_agree_as_well() -> None:
     left = random(600, 3) * SIZE
-    for right_x in (SIZE[0] - left[:, 0], 2 * left[:, 0], left[:, 0] + left[:, 1]):
+    for right_x in (SIZE[0] - left[:, 0], 2.5 * left[:, 0]):
         matches = Matches(left, torch.stack([right_x, left[:, 1]], 1), torch.tensor([0, 600]))
         assert estimate(matches, "auto").rectified.tolist() == [False]
 

@@ -224,7 +224,7 @@ def _db() -> list[Seed]:
         import pycolmap  # noqa: F401
     except ImportError:
         return made
-    return [*made, _filter("m.db", in_memory(write_with_colmap, ".db"), "--score", "none")]
+    return [*made, _filter("m.db", in_memory(write_with_colmap, ".db"), "--verdict", "cardinality", "--score", "none")]
 
 
 def image(view: int, *, colour: bool = False, bits: int = 8) -> NDArray[Any]:
@@ -340,7 +340,7 @@ SWEEPS = (
     '# two points\nexport_matches = true\n\n[grid]\ndetector = ["gftt"]\nscore = ["learned", "none"]\n'
     'verdict = ["cardinality"]\noutlier_rate = 0.2\nseed = 1\ngftt.window_px = 7\n',
     '[[grid]]\ndetector = "fast"\nscore = "consensus"\n[grid.fast]\nthreshold = 15\nwindow_px = [9, 11]\n'
-    '[grid.consensus]\nrow_tolerance_px = "none"\n\n[[grid]]\ndetector = "surf"\nverdict = "adjacency"\n'
+    '[grid.consensus]\nrow_tolerance_px = 0.5\n\n[[grid]]\ndetector = "surf"\nverdict = "adjacency"\n'
     "surf.num_octaves = 3\nmatching.max_ratio = 0.9\n",
     '[grid]\ndetector = "sift"\nsift.backend = "opencv"\nconstrained = true\nobjects.element_px = 3\n'
     "min_precision = 0.8\nmatching = { mutual = true, max_disparity_px = 40.0 }\nmax_error_px = 2\n",

@@ -4,87 +4,26 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from tensor_stereo.batching import from_padded, lengths_to_ptr, select_matches
+from tensor_stereo.batching import from_padded, lengths_to_ptr
 from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
 from tensor_stereo.configs import COLDEST, HOTTEST, ConsensusConfig, FilterConfig
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores.alignment import Alignment
+from tensor_stereo.outputs import FilterOutput as FilterOutput
+from tensor_stereo.outputs import Images as Images
 from tensor_stereo.scores.by_name import score_matches
 from tensor_stereo.scores.image_evidence import ImageEvidence
 from tensor_stereo.scores.learned import LearnedNetworks, load_learned
-from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
 
-Images = Tensor | Sequence[Tensor]
 _RENAMED = {"restriction": "verdict", "unit": "temperature_unit"}
-
-
-@dataclass(frozen=True, eq=False)
-class FilterOutput:
-    """Verdicts and scores in the layout of the input.
-
-    The layout is (B, N) for padded keypoints, (N,) for one pair without batch axis, and (M,) for :class:`Matches`.
-
-    Attributes:
-        inlier: bool; False for untested matches and in the padding.
-        score: in [0, 1], higher is better; 0 for untested matches and in the padding. ``consensus`` and ``learned`` are
-            the calibrated probability of an error of at most ``max_error_px``, ``topology`` is a similarity. None if
-            the settings ask for none.
-        relation: int8 values of :class:`Relation`, UNTESTED in the padding.
-        matches: the M real matches of the input, as one ragged batch.
-        mask: bool, the places of ``matches`` in the layout; None for ragged input.
-        alignment: What the matches of each of the B pairs share, which the score has taken out: row offset and drift of
-            rectified pairs, map and epipolar lines of others, and whether enough matches agree on them; None where the
-            score takes none out.
-        cumulative: One axis more: probabilities of an error of at most each of
-            :data:`tensor_stereo.scores.TOLERANCES_PX`, 0 where the score is; None where that is no probability.
-        domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
-            probability was calibrated on, 0 inside; None where there is no probability.
-    """
-
-    inlier: Tensor
-    score: Tensor | None
-    relation: Tensor
-    matches: Matches
-    mask: Tensor | None = None
-    alignment: Alignment | None = None
-    cumulative: Tensor | None = None
-    domain: Tensor | None = None
-
-    def probability(self, max_error_px: float) -> Tensor:
-        """The calibrated probability of an error of at most ``max_error_px``, without another pass.
-
-        At the tolerance of the settings it is ``score``, bit for bit, but without ``straight_through``.
-
-        Args:
-            max_error_px: From .5 to 5 px of view 0.
-
-        Returns:
-            In the layout and the dtype of ``score``, 0 where that is 0. It never falls when the tolerance grows.
-            Gradients flow as from ``score``.
-
-        Raises:
-            ValueError: for another tolerance, or where the score is no probability.
-
-        >>> left = torch.rand(50, 2, generator=torch.Generator().manual_seed(0)) * 100
-        >>> output = DelaunayFilter()(left, left - torch.tensor([2.0, 0.0]))
-        >>> torch.equal(output.probability(1), output.score)
-        True
-        """
-        found = probability_within(self.cumulative, max_error_px)
-        return found if self.score is None else found.to(self.score.dtype)
-
-    def to_matches(self) -> Matches:
-        """The inliers, for the next filter. All pairs stay, some possibly empty; gradients flow to the keypoints."""
-        return select_matches(self.matches, self.inlier if self.mask is None else self.inlier[self.mask])
 
 
 class DelaunayFilter(nn.Module):
@@ -309,7 +248,7 @@ class DelaunayFilter(nn.Module):
             spread[name] = None if values is None else _spread(values, mask)
         if single:
             spread = {name: None if values is None else values[0] for name, values in spread.items()}
-        return FilterOutput(matches=matches, alignment=output.alignment, domain=output.domain, **spread)
+        return FilterOutput(matches=matches, alignment=output.alignment, domain=output.domain, judge=self, **spread)
 
     def _decide(
         self, matches: Matches, images0: Images | None, images1: Images | None, evidence: ImageEvidence | None
@@ -323,7 +262,7 @@ class DelaunayFilter(nn.Module):
                     raise TypeError(f"{name} must be None where there is no score")
             graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
             verdict = classify_graphs(graphs, config)
-            return FilterOutput(verdict.inlier, None, verdict.relation, matches)
+            return FilterOutput(verdict.inlier, None, verdict.relation, matches, judge=self)
         found = score_matches(
             matches, config, images=images, evidence=evidence, temperature=self.temperature, network=self.network
         )
@@ -336,7 +275,15 @@ class DelaunayFilter(nn.Module):
             score = score + (verdict.inlier.to(score.dtype) - score).detach()
         cumulative = mask_untested(found.cumulative, verdict)
         return FilterOutput(
-            verdict.inlier, score, verdict.relation, matches, None, found.alignment, cumulative, found.domain
+            verdict.inlier,
+            score,
+            verdict.relation,
+            matches,
+            None,
+            found.alignment,
+            cumulative,
+            found.domain,
+            judge=self,
         )
 
 

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from tensor_stereo.scores.learned import learned_probabilities as learned_probabilities
     from tensor_stereo.scores.learned import load_learned as load_learned
     from tensor_stereo.scores.learned import score_learned as score_learned
+    from tensor_stereo.scores.refine import refine_matches as refine_matches
+    from tensor_stereo.scores.repair import Origin as Origin
+    from tensor_stereo.scores.repair import RepairedMatches as RepairedMatches
+    from tensor_stereo.scores.repair import repair_matches as repair_matches
     from tensor_stereo.scores.slopes import estimate_slopes as estimate_slopes
     from tensor_stereo.scores.tolerance import TOLERANCES_PX as TOLERANCES_PX
     from tensor_stereo.scores.tolerance import probability_within as probability_within
@@ -39,6 +43,8 @@ __getattr__, __dir__, __all__ = attach(
         "DomainWarning": "domain",
         "ImageEvidence": "image_evidence",
         "LearnedScore": "learned",
+        "Origin": "repair",
+        "RepairedMatches": "repair",
         "ScoredMatches": "by_name",
         "TOLERANCES_PX": "tolerance",
         "align_matches": "alignment",
@@ -55,6 +61,8 @@ __getattr__, __dir__, __all__ = attach(
         "load_learned": "learned",
         "measure_images": "image_evidence",
         "probability_within": "tolerance",
+        "refine_matches": "refine",
+        "repair_matches": "repair",
         "score_learned": "learned",
         "score_matches": "by_name",
     },

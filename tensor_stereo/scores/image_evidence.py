@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tensor_stereo.features import list_images, to_gray
+from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, no_alignment
-from tensor_stereo.scores.samplers import Place, Sampler, find_places, pair_samplers
+from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs
 from tensor_stereo.scores.windows import (
     LIKE,
     MIDDLE,
@@ -133,13 +133,9 @@ def measure_images(
     width = max((count for _, count in ranges), default=0)
     parts = [_empty(matches.keypoints0, width)]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
-        for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
-            gray = [to_gray(images[b][None])[0, 0].float().to(matches.ptr.device) for images in views]
-            gray[1] = gray[1] - _brighter(gray, *(k[start:stop] for k in (matches.keypoints0, matches.keypoints1)))
-            own = places.select(slice(start, stop))
-            samplers = pair_samplers(gray, own, alignment.select(b, b + 1), matches.keypoints1[start:stop])
-            for row in range(0, stop - start, _ROWS_AT_ONCE):
-                rows = slice(row, min(row + _ROWS_AT_ONCE, stop - start))
+        for b, (samplers, own) in enumerate(look_at_pairs(views, matches, places, alignment)):
+            for row in range(0, len(own.left), _ROWS_AT_ONCE):
+                rows = slice(row, row + _ROWS_AT_ONCE)
                 looks = [sampler.select(rows) for sampler in samplers]
                 parts.append(_measure_both(looks, own.select(rows), *ranges[b], width, has_rows=has_rows[b]))
     values, curve0, curve1, offset, first = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -186,20 +182,6 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
             last = first + MAX_DISPARITIES - 1
         ranges.append((first, last - first + 1))
     return ranges
-
-
-def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> Tensor:
-    """() by how many grey levels view 1 is brighter, the median over the matches of a pair."""
-    if not len(points0):
-        return gray[0].new_zeros(())
-    levels = []
-    for image, points in zip(gray, (points0, points1), strict=True):
-        smooth = functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
-        x, y = (
-            place.round().clamp(0, size - 1).long() for place, size in zip(points.t(), smooth.t().shape, strict=True)
-        )
-        levels.append(smooth[y, x])
-    return torch.quantile(levels[1] - levels[0], 0.5)  # the same in a mirror, unlike the lower median
 
 
 def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
+from tensor_stereo.features import to_gray
 from tensor_stereo.graphs import MatchGraphs
 from tensor_stereo.scores.alignment.form import Alignment, epipolar_frames, map_points
 from tensor_stereo.scores.slopes import estimate_slopes
@@ -42,9 +44,15 @@ class Place(NamedTuple):
     across: Tensor
     slope: Tensor
 
-    def select(self, rows: slice) -> Place:
+    def select(self, rows: slice | Tensor) -> Place:
         """Those of some matches."""
         return Place(*(values[rows] for values in self))
+
+    @property
+    def off_line(self) -> Tensor:
+        """(m,) px, how far the partner lies from its line, across it."""
+        x, y = (self.right - self.left).unbind(1)
+        return self.along[:, 0] * y - self.along[:, 1] * x - self.across
 
 
 def find_places(matches: Matches, aligned: Matches, graphs: MatchGraphs, alignment: Alignment) -> Place:
@@ -94,7 +102,7 @@ class RowSampler(NamedTuple):
         x = start[:, :1] + torch.arange(count, device=start.device)
         return (x < 0) | (x > self.image.shape[1] - 1)
 
-    def select(self, rows: slice) -> RowSampler:  # noqa: ARG002  # as of other samplers
+    def select(self, rows: slice | Tensor) -> RowSampler:  # noqa: ARG002  # as of other samplers
         """That of some matches."""
         return self
 
@@ -134,7 +142,7 @@ class LineSampler(NamedTuple):
         x, y = torch.where(inside[..., None], points, 0).unbind(2)
         return ~inside | ~self.known[y, x]
 
-    def select(self, rows: slice) -> LineSampler:
+    def select(self, rows: slice | Tensor) -> LineSampler:
         """That of some matches."""
         return self._replace(along=self.along[rows])
 
@@ -156,18 +164,46 @@ class LineSampler(NamedTuple):
 Sampler = RowSampler | LineSampler
 
 
-def pair_samplers(
-    gray: Sequence[Tensor], places: Place, alignment: Alignment, keypoints1: Tensor
-) -> tuple[Sampler, Sampler]:
-    """How both views of one pair are looked at."""
-    if bool(alignment.rectified[0]):
-        return RowSampler(gray[0]), RowSampler(gray[1])
-    warped = warp_view(gray[0], gray[1], alignment.to_view0[0], keypoints1)
-    known0 = torch.ones_like(gray[0], dtype=torch.bool)
-    return (
-        LineSampler(warped.image0, torch.zeros_like(warped.origin), places.along, known0),
-        LineSampler(warped.image1, warped.origin, places.along, warped.known1),
-    )
+def look_at_pairs(
+    views: Sequence[Sequence[Tensor]], matches: Matches, places: Place, alignment: Alignment
+) -> Iterator[tuple[tuple[Sampler, Sampler], Place]]:
+    """How both views of each pair are looked at, and the places of its matches.
+
+    Args:
+        views: The B images (C, H, W) of view 0, and those of view 1, whose common change of brightness is taken out.
+        matches: B pairs.
+        places: Those of all matches.
+        alignment: What the matches of every pair share.
+    """
+    for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
+        gray = [to_gray(images[b][None])[0, 0].float().to(matches.ptr.device) for images in views]
+        points = matches.keypoints0[start:stop], matches.keypoints1[start:stop]
+        gray[1] = gray[1] - _brighter(gray, *points)
+        own = places.select(slice(start, stop))
+        if bool(alignment.rectified[b]):
+            yield (RowSampler(gray[0]), RowSampler(gray[1])), own
+            continue
+        warped = warp_view(gray[0], gray[1], alignment.to_view0[b], points[1])
+        known0 = torch.ones_like(gray[0], dtype=torch.bool)
+        looks = (
+            LineSampler(warped.image0, torch.zeros_like(warped.origin), own.along, known0),
+            LineSampler(warped.image1, warped.origin, own.along, warped.known1),
+        )
+        yield looks, own
+
+
+def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> Tensor:
+    """() by how many grey levels view 1 is brighter, the median over the matches of a pair."""
+    if not len(points0):
+        return gray[0].new_zeros(())
+    levels = []
+    for image, points in zip(gray, (points0, points1), strict=True):
+        smooth = functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
+        x, y = (
+            place.round().clamp(0, size - 1).long() for place, size in zip(points.t(), smooth.t().shape, strict=True)
+        )
+        levels.append(smooth[y, x])
+    return torch.quantile(levels[1] - levels[0], 0.5)  # the same in a mirror, unlike the lower median
 
 
 class WarpedView(NamedTuple):

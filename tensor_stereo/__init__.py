@@ -14,9 +14,11 @@ if TYPE_CHECKING:
     from tensor_stereo.configs import FilterConfig as FilterConfig
     from tensor_stereo.configs import MatchingConfig as MatchingConfig
     from tensor_stereo.configs import PipelineConfig as PipelineConfig
+    from tensor_stereo.configs import SGBMConfig as SGBMConfig
     from tensor_stereo.dense.filtering import FilteredDisparity as FilteredDisparity
     from tensor_stereo.dense.filtering import filter_disparity as filter_disparity
     from tensor_stereo.dense.interpolation import interpolate_disparity as interpolate_disparity
+    from tensor_stereo.dense.partners import sample_disparity as sample_disparity
     from tensor_stereo.evaluation.dataset import score_dataset as score_dataset
     from tensor_stereo.graphs import build_graphs as build_graphs
     from tensor_stereo.interop.match_files import filter_file as filter_file
@@ -56,6 +58,7 @@ __getattr__, __dir__, __all__ = attach(
         "PipelineConfig": "configs",
         "PipelineOutput": "pipeline",
         "Relation": "types",
+        "SGBMConfig": "configs",
         "StereoPair": "types",
         "backend": "ops.backends",
         "build_graphs": "graphs",
@@ -66,6 +69,7 @@ __getattr__, __dir__, __all__ = attach(
         "filter_files": "interop.match_folders",
         "interpolate_disparity": "dense.interpolation",
         "run_pipeline": "pipeline",
+        "sample_disparity": "dense.partners",
         "score_dataset": "evaluation.dataset",
         "score_matches": "scores.by_name",
     },

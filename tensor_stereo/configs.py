@@ -6,7 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, get_args
 
-from tensor_stereo.limits import Count, Fraction, NotNegative, OddPx, Positive, Within, check_settings
+from tensor_stereo.limits import Count, Fraction, NotNegative, Positive, Within, check_settings
+from tensor_stereo.step_configs import FASTConfig as FASTConfig
+from tensor_stereo.step_configs import GFTTConfig as GFTTConfig
+from tensor_stereo.step_configs import MatchingConfig as MatchingConfig
+from tensor_stereo.step_configs import ObjectsConfig as ObjectsConfig
+from tensor_stereo.step_configs import SGBMConfig as SGBMConfig
+from tensor_stereo.step_configs import SIFTConfig as SIFTConfig
+from tensor_stereo.step_configs import SURFConfig as SURFConfig
 
 Detector = Literal["sift", "fast", "surf", "gftt"]
 Restriction = Literal["adjacency", "cardinality"]
@@ -27,93 +34,7 @@ DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of t
 LEAST_ERROR_PX, MOST_ERROR_PX = 0.5, 5.0  # tolerances between which a score is calibrated
 COLDEST, HOTTEST = 1e-9, 1e9  # temperatures whose gradients are finite in float32 too
 
-
-Ratio = Annotated[float, Within(0, 1, open_low=True)]
 Tolerance = Annotated[float, Within(LEAST_ERROR_PX, MOST_ERROR_PX)]
-
-
-@dataclass(frozen=True)
-class SIFTConfig:
-    """Scale-invariant feature transform (Lowe 2004): sub-pixel keypoints, 128-vectors."""
-
-    backend: Literal["kornia", "opencv"] = "kornia"
-    max_keypoints: Count = 2000
-    upright: bool = False  # no orientation: more matches between rectified views, a little fewer of them correct
-    max_ratio: Ratio | None = 0.8  # best / second-best distance; Lowe 2004; None: no test
-
-    def __post_init__(self) -> None:
-        check_settings(self, prefix="SIFTConfig.")
-
-
-@dataclass(frozen=True)
-class FASTConfig:
-    """Features from accelerated segment test (Rosten & Drummond 2006), OpenCV's detector, with image windows."""
-
-    threshold: Annotated[int, Within(0, 255)] = 20  # grey levels by which the arc must differ from the centre
-    nonmax_suppression: bool = True
-    max_keypoints: Count = 2000  # the strongest are kept
-    window_px: OddPx = 11  # side of the square window that SSD compares, odd
-
-    def __post_init__(self) -> None:
-        check_settings(self, prefix="FASTConfig.")
-
-
-@dataclass(frozen=True)
-class SURFConfig:
-    """Speeded-up robust features (Bay et al. 2006), mahotas' implementation, 64-vectors."""
-
-    num_octaves: Annotated[int, Within(1, 8)] = 4
-    num_scales: Annotated[int, Within(3, 16)] = 6
-    initial_step_px: Annotated[int, Within(1, 16)] = 1
-    threshold: Annotated[float, Within(0)] = 0.1  # on the determinant of the Hessian, in mahotas' scale
-    max_keypoints: Count = 2000
-
-    def __post_init__(self) -> None:
-        check_settings(self, prefix="SURFConfig.")
-
-
-@dataclass(frozen=True)
-class GFTTConfig:
-    """Good features to track (Shi & Tomasi 1994), with image windows."""
-
-    backend: Literal["kornia", "opencv"] = "kornia"
-    quality_level: Annotated[float, Within(1e-9, 1)] = 0.01  # fraction of the image's strongest response
-    min_distance_px: Annotated[int, Within(0, 2**15)] = 3
-    max_keypoints: Count = 1000
-    window_px: OddPx = 11  # side of the square window that SSD compares, odd
-
-    def __post_init__(self) -> None:
-        check_settings(self, prefix="GFTTConfig.")
-
-
-@dataclass(frozen=True)
-class MatchingConfig:
-    """Nearest neighbour by sum of squared differences, one-to-one by lowest cost. ``None`` switches a gate off."""
-
-    max_ratio: Ratio | None = None  # best / second-best distance; None: what the detector's own settings say
-    mutual: bool = False  # keep only pairs that are each other's nearest neighbour
-    max_row_offset_px: Annotated[float, Within(0)] | None = None  # |y0 - y1|
-    min_disparity_px: Annotated[float, Within(open_high=True)] | None = None  # x0 - x1
-    max_disparity_px: Annotated[float, Within(open_low=True)] | None = None
-
-    def __post_init__(self) -> None:
-        check_settings(self, prefix="MatchingConfig.")
-        low, high = self.min_disparity_px, self.max_disparity_px
-        if low is not None and high is not None and low > high:
-            raise ValueError(
-                f"MatchingConfig.min_disparity_px must be at most MatchingConfig.max_disparity_px, got {low} > {high}"
-            )
-
-
-@dataclass(frozen=True)
-class ObjectsConfig:
-    """Object contours of Restriction 3 (the paper, section 3)."""
-
-    element_px: OddPx = 5  # side of the square structuring element, odd
-    min_area_px: Annotated[float, Within(0)] = 50.0  # area that a contour must enclose
-
-    def __post_init__(self) -> None:
-        check_settings(self, prefix="ObjectsConfig.")
 
 
 @dataclass(frozen=True)
@@ -249,14 +170,27 @@ def describe_settings(config: FilterConfig) -> str:
 
 @dataclass(frozen=True)
 class StepConfigs(FilterConfig):
-    """Settings of all steps, whichever detector runs."""
+    """Settings of all steps, whichever detector runs.
+
+    Raises:
+        ValueError: also if pairs may be other than rectified where the matches come from a semi-global map.
+    """
 
     sift: SIFTConfig = field(default_factory=SIFTConfig)
     fast: FASTConfig = field(default_factory=FASTConfig)
     surf: SURFConfig = field(default_factory=SURFConfig)
     gftt: GFTTConfig = field(default_factory=GFTTConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
+    sgbm: SGBMConfig = field(default_factory=SGBMConfig)  # of the matching method sgbm
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.matching.method == "sgbm" and self.rectified is not True:
+            raise ValueError(
+                f"rectified must be True where MatchingConfig.method is 'sgbm', got {self.rectified!r}: "
+                "semi-global matching looks for partners on the same row"
+            )
 
 
 @dataclass(frozen=True)
@@ -270,10 +204,12 @@ class PipelineConfig(StepConfigs):
     def resolved_matching(self) -> MatchingConfig:
         """The matcher's settings, with the ratio of the detector's own settings where the matcher's say none.
 
+        Semi-global matching has no ratio.
+
         >>> PipelineConfig(detector="sift").resolved_matching.max_ratio
         0.8
         """
-        if self.matching.max_ratio is None and self.detector == "sift":
+        if self.matching.method == "ssd" and self.matching.max_ratio is None and self.detector == "sift":
             return replace(self.matching, max_ratio=self.sift.max_ratio)
         return self.matching
 

@@ -51,6 +51,20 @@ class Odd:
         return f"be odd and lie in [1, {self.high}]"
 
 
+@dataclass(frozen=True)
+class MultipleOf:
+    """A positive number of pixels that is a multiple of another."""
+
+    step: int
+    high: int
+
+    def __contains__(self, value: int) -> bool:
+        return self.step <= value <= self.high and value % self.step == 0
+
+    def __str__(self) -> str:
+        return f"be a multiple of {self.step} and lie in [{self.step}, {self.high}]"
+
+
 Fraction = Annotated[float, Within(0, 1)]
 Positive = Annotated[float, Within(0, open_low=True, open_high=True)]
 NotNegative = Annotated[float, Within(0, open_high=True)]

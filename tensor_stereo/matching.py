@@ -103,7 +103,7 @@ def match_indices(features0: Features, features1: Features, config: PipelineConf
 
     Raises:
         ValueError: if the features differ in the number of images or in descriptor length, or hold values that are not
-            finite (descriptors; with gates, keypoints beyond 2**24 px).
+            finite (descriptors; with gates, keypoints beyond 2**24 px); if the settings ask for another method.
 
     >>> ptr = torch.tensor([0, 2])
     >>> features = Features(torch.zeros(2, 2), ptr, torch.tensor([[3.0], [5.0]]), torch.ones(2))
@@ -112,6 +112,8 @@ def match_indices(features0: Features, features1: Features, config: PipelineConf
     """
     config = config or PipelineConfig()
     matching = config.resolved_matching
+    if matching.method != "ssd":
+        raise ValueError(f"MatchingConfig.method must be 'ssd' where descriptors are matched, got {matching.method!r}")
     features0, features1 = (replace(f, descriptors=f.descriptors.float()) for f in (features0, features1))
     peak = _check_features(features0, features1)
     best = _Best.empty(features0, features1, ratio=matching.max_ratio is not None, mutual=matching.mutual)

@@ -13,6 +13,7 @@ from torch import Tensor
 from tensor_stereo.batching import concatenate_features, split_features
 from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
 from tensor_stereo.configs import PipelineConfig, Rectified
+from tensor_stereo.dense.semi_global import SemiGlobalMaps, match_keypoints, match_semi_global
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
@@ -94,6 +95,7 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
 
     Raises:
         ValueError: if there is no pair, the views of a rectified one differ in size, or an image has another layout.
+            Settings that ask for semi-global matching of pairs that are not rectified cannot be made.
 
     Example:
         >>> from tensor_stereo.datasets.synthetic.rendering import render_pair
@@ -137,7 +139,12 @@ def to_gray_pairs(pairs: Sequence[ImagePair], *, rectified: Rectified = True) ->
 
 
 def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwatch) -> Matches:
-    """Features of every image, then the putative matches of every pair."""
+    """Features of every image that needs them, then the putative matches of every pair."""
+    if config.matching.method == "sgbm":
+        with watch.measure("detect"):
+            keypoints = concatenate_features(detect_images([pair[0] for pair in gray], config))
+        with watch.measure("match"):
+            return match_keypoints(keypoints, map_pairs(gray, config), config.matching)
     with watch.measure("detect"):
         features0, features1 = detect_pairs(gray, config)
     with watch.measure("match"):
@@ -161,6 +168,12 @@ def detect_images(images: Sequence[Tensor], config: PipelineConfig) -> list[Feat
         features = detect_features(torch.cat([images[k] for k in places]), config)
         found.update(zip(places, split_features(features), strict=True))
     return [found[k] for k in range(len(images))]
+
+
+def map_pairs(gray: Sequence[ImagePair], config: PipelineConfig) -> SemiGlobalMaps:
+    """Semi-global disparity maps of both views of every pair."""
+    images0, images1 = ([pair[view][0] for pair in gray] for view in (0, 1))
+    return match_semi_global(images0, images1, config.sgbm)
 
 
 def group_pairs(gray: Sequence[ImagePair], matches: Matches, config: PipelineConfig, watch: Stopwatch) -> Matches:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tensor_stereo as ts
-from tensor_stereo import configs
+from tensor_stereo import configs, step_configs
 from tensor_stereo.configs import (
     CUTS,
     RESTRICTIONS,
@@ -24,6 +24,7 @@ from tensor_stereo.configs import (
     MatchingConfig,
     ObjectsConfig,
     PipelineConfig,
+    SGBMConfig,
     SIFTConfig,
     SURFConfig,
     SyntheticConfig,
@@ -78,6 +79,16 @@ WRONG: list[tuple[type, str, object]] = [
     (MatchingConfig, "max_disparity_px", -math.inf),
     (MatchingConfig, "max_disparity_px", math.nan),
     (MatchingConfig, "mutual", "yes"),
+    (MatchingConfig, "method", "bm"),
+    *((SGBMConfig, "window_px", value) for value in (0, 4, 13, 5.0)),
+    *((SGBMConfig, "num_disparities_px", value) for value in (0, 100, -16, 1040, 16.0)),
+    (SGBMConfig, "min_disparity_px", 0.5),
+    (SGBMConfig, "min_disparity_px", -1001),
+    (SGBMConfig, "step_penalty_levels", 0.0),
+    (SGBMConfig, "step_penalty_levels", 32.0),  # not less than the other
+    (SGBMConfig, "jump_penalty_levels", math.inf),
+    (SGBMConfig, "mode", "hh4"),
+    (SGBMConfig, "left_right", 1),
     (ObjectsConfig, "element_px", 4),
     (ObjectsConfig, "min_area_px", -1.0),
     (PipelineConfig, "detector", "orb"),
@@ -100,7 +111,7 @@ def test_a_wrong_value_is_named_with_its_setting(kind: type, name: str, value: o
 
 @pytest.mark.parametrize("kind", [k for k in vars(configs).values() if isinstance(k, type) and k.__name__ != "Within"])
 def test_every_settings_object_checks_itself(kind: type) -> None:
-    if kind.__module__ == configs.__name__:
+    if kind.__module__ in (configs.__name__, step_configs.__name__):
         assert "__post_init__" in {name for base in kind.__mro__ for name in vars(base)}
         for field in fields(kind):
             with pytest.raises((ValueError, TypeError), match=field.name):
@@ -115,6 +126,24 @@ def test_numbers_of_numpy_are_numbers() -> None:
 def test_bounds_of_the_gates_must_be_in_order() -> None:
     with pytest.raises(ValueError, match=r"must be at most MatchingConfig\.max_disparity_px, got 5\.0 > 4\.0"):
         MatchingConfig(min_disparity_px=5.0, max_disparity_px=4.0)
+
+
+@pytest.mark.parametrize(("name", "value", "off"), [("max_ratio", 0.8, "None"), ("mutual", True, "False")])
+def test_semi_global_matching_compares_no_neighbours(name: str, value: Any, off: str) -> None:
+    words = rf"MatchingConfig\.{name} must be {off} where MatchingConfig\.method is 'sgbm', got {value}"
+    with pytest.raises(ValueError, match=words):
+        MatchingConfig(method="sgbm", **{name: value})
+    sift = PipelineConfig(detector="sift", matching=MatchingConfig(method="sgbm"))
+    assert sift.resolved_matching.max_ratio is None
+
+
+@pytest.mark.parametrize("kind", [PipelineConfig, TrialConfig, EvaluationConfig])
+def test_semi_global_matching_is_for_rectified_pairs(kind: type) -> None:
+    matching = MatchingConfig(method="sgbm")
+    assert kind(matching=matching).rectified is True
+    for rectified in (False, "auto"):
+        with pytest.raises(ValueError, match=r"^rectified must be True where MatchingConfig\.method is 'sgbm'"):
+            kind(matching=matching, rectified=rectified)
 
 
 def is_contradiction(settings: dict[str, Any]) -> bool:

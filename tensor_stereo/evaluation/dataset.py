@@ -11,24 +11,27 @@ import polars as pl
 import torch
 from torch.utils.data import Dataset
 
-from tensor_stereo.configs import ConsensusConfig, Detector, EvaluationConfig, SweepConfig
+from tensor_stereo.configs import ConsensusConfig, Detector, EvaluationConfig, SGBMConfig, SweepConfig
 from tensor_stereo.evaluation.metrics import IsolatedCounts, isolated_update
 from tensor_stereo.evaluation.trials import STAGES, Trial, TrialRunner
 from tensor_stereo.objects import isolated_matches
 from tensor_stereo.types import StereoPair
 
+_COLUMN_TYPES = {bool: pl.Boolean, int: pl.Int32, float: pl.Float64, str: pl.String}
 ROW_SCHEMA: dict[str, Any] = {
     "trial": pl.Int32,  # number of the setting in the configuration
     "dataset": pl.String,
     "scene": pl.String,
     "detector": pl.String,
     "feature_backend": pl.String,  # null where the detector has one implementation
-    "window_px": pl.Int32,  # null where descriptors are no image windows
+    "method": pl.String,  # of matching: ssd or sgbm
+    "window_px": pl.Int32,  # null where no image windows are compared by SSD
     "max_ratio": pl.Float64,  # null: no ratio test; so for every gate
     "mutual": pl.Boolean,
     "max_row_offset_px": pl.Float64,
     "min_disparity_px": pl.Float64,
     "max_disparity_px": pl.Float64,
+    **{f"sgbm_{name}": _COLUMN_TYPES[type(value)] for name, value in vars(SGBMConfig()).items()},  # of sgbm, else null
     "variant": pl.String,  # unconstrained, or constrained: Restriction 3
     "verdict": pl.String,  # score, adjacency or cardinality
     "min_group_size": pl.Int32,

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from tensor_stereo.classification import apply_score, classify_graphs
 from tensor_stereo.configs import CUTS, TrialConfig
+from tensor_stereo.dense.semi_global import match_keypoints
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, roc_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
 from tensor_stereo.evaluation.truth import errors_against_gt
@@ -19,7 +20,7 @@ from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.pipeline import STAGES as PIPELINE_STAGES
-from tensor_stereo.pipeline import Stopwatch, detect_pairs, score_pairs, to_gray_pairs
+from tensor_stereo.pipeline import Stopwatch, detect_pairs, map_pairs, score_pairs, to_gray_pairs
 from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.types import Classification, Matches, Relation, StereoPair
 
@@ -116,15 +117,18 @@ def setting_columns(config: TrialConfig) -> dict[str, Any]:
     ['true', 'false', 'auto']
     """
     features, score = getattr(config, config.detector), config.resolved_score
+    is_dense = config.matching.method == "sgbm"
     return {
         "detector": config.detector,
         "feature_backend": getattr(features, "backend", None),
-        "window_px": getattr(features, "window_px", None),
+        "method": config.matching.method,
+        "window_px": None if is_dense else getattr(features, "window_px", None),
         "max_ratio": config.resolved_matching.max_ratio,
         "mutual": config.matching.mutual,
-        "max_row_offset_px": config.matching.max_row_offset_px,
+        "max_row_offset_px": None if is_dense else config.matching.max_row_offset_px,
         "min_disparity_px": config.matching.min_disparity_px,
         "max_disparity_px": config.matching.max_disparity_px,
+        **{f"sgbm_{name}": value if is_dense else None for name, value in vars(config.sgbm).items()},
         "variant": "constrained" if config.constrained else "unconstrained",
         "verdict": config.verdict,
         "min_group_size": config.min_group_size,
@@ -157,7 +161,11 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
     if trial.detector == "sift":
         features = replace(features, max_ratio=None)  # a setting of the matcher
     keys: dict[str, Hashable] = {"detect": (trial.detector, features)}
-    keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
+    if trial.matching.method == "sgbm":
+        keys["disparity"] = trial.sgbm  # of the images alone
+        keys["match"] = keys["detect"], trial.matching, trial.sgbm
+    else:
+        keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
     keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed
     if trial.constrained:
         keys["label"] = trial.objects  # of the images alone
@@ -221,7 +229,12 @@ class TrialRunner:
             return result
 
         features = share("detect", lambda: detect_pairs(self._gray, trial))
-        putative = share("match", lambda: match_features(*features, trial))
+        if trial.matching.method == "sgbm":
+            maps = share("disparity", lambda: map_pairs(self._gray, trial))
+            putative = share("match", lambda: match_keypoints(features[0], maps, trial.matching))
+            seconds["match"] += seconds.pop("disparity")
+        else:
+            putative = share("match", lambda: match_features(*features, trial))
         matches, error_px = share("perturb", lambda: self._perturb(putative, trial))
         correct, valid = error_px <= trial.max_error_px, ~error_px.isnan()
         if trial.constrained:

@@ -13,6 +13,7 @@ from torch import Tensor
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.types import check_tensor
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 
@@ -106,11 +107,20 @@ def map_images(function: Callable[[Tensor], T], images: Tensor, *, max_workers: 
     >>> map_images(lambda image: int(image.sum()), torch.ones(2, 1, 3, 4, dtype=torch.uint8))
     [12, 12]
     """
-    workers = min(len(images), torch.get_num_threads(), max_workers or len(images))
+    return map_threads(function, images[:, 0].unbind(), max_workers=max_workers)
+
+
+def map_threads(function: Callable[[S], T], items: Sequence[S], *, max_workers: int | None = None) -> list[T]:
+    """Apply a function that is free of side effects to every item, as :func:`map_images` does to every image.
+
+    >>> map_threads(len, ["a", "", "bc"])
+    [1, 0, 2]
+    """
+    workers = min(len(items), torch.get_num_threads(), max_workers or len(items))
     if workers <= 1:
-        return [function(image) for image in images[:, 0]]
+        return [function(item) for item in items]
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(function, images[:, 0]))
+        return list(pool.map(function, items))
 
 
 def strongest_first(keypoints: Tensor, scores: Tensor, max_keypoints: int) -> Tensor:

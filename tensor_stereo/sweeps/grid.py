@@ -12,7 +12,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from tensor_stereo.configs import DETECTORS, ObjectsConfig, SweepConfig, TrialConfig
+from tensor_stereo.configs import DETECTORS, ObjectsConfig, SGBMConfig, SweepConfig, TrialConfig
 from tensor_stereo.limits import LimitError
 
 _DEFAULT = TrialConfig()
@@ -82,9 +82,9 @@ def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
     """The points of a union of products.
 
     Settings that a point does not use (other detectors, the seed where nothing is random, the temperature of another
-    score than topology, the settings of consensus for another score) are set to their defaults, and equal points are
-    one. Points whose settings contradict each other, such as a threshold under a verdict of the paper, are errors that
-    are listed together: such a grid is several tables.
+    score than topology, the settings of consensus for another score, those of another matching method) are set to their
+    defaults, and equal points are one. Points whose settings contradict each other, such as a threshold under a verdict
+    of the paper, are errors that are listed together: such a grid is several tables.
 
     Args:
         tables: settings as :func:`read_grid` describes them, nested by their dots.
@@ -157,7 +157,19 @@ def simplify(trial: TrialConfig) -> TrialConfig:
         unused["rectified"] = _DEFAULT.rectified
     if not trial.constrained:
         unused["objects"] = ObjectsConfig()
+    if trial.matching.method == "sgbm":
+        unused["matching"] = replace(trial.matching, max_row_offset_px=None)
+        unused[trial.detector] = _without_descriptors(getattr(trial, trial.detector))
+    else:
+        unused["sgbm"] = SGBMConfig()
     return replace(trial, **unused)
+
+
+def _without_descriptors(features: Any) -> Any:
+    """Settings of a detector with those of its descriptors at their defaults."""
+    default = type(features)()
+    own = {name: getattr(default, name) for name in ("window_px", "max_ratio") if hasattr(default, name)}
+    return replace(features, **own)
 
 
 def _axes(table: Any, config: type, prefix: str) -> Iterator[tuple[tuple[str, ...], list[Any]]]:

@@ -164,6 +164,26 @@ def test_nested_settings_reach_the_score(scene: Path, tmp_path: Path) -> None:
     assert not pl.read_parquet(out)["probability"].equals(plain["probability"])
 
 
+def test_semi_global_matching_has_flags(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out, images = tmp_path / "matches.parquet", [scene / "im0.png", scene / "im1.png"]
+    command = ["classify", *map(str, images), "--out", str(out), "--matching.method", "sgbm"]
+    main([*command, "--sgbm.window-px", "7", "--sgbm.num-disparities-px", "64", "--sgbm.mode", "hh"])
+    table = pl.read_parquet(out)
+    settings = ts.SGBMConfig(window_px=7, num_disparities_px=64, mode="hh")
+    config = ts.PipelineConfig(matching=ts.MatchingConfig(method="sgbm"), sgbm=settings)
+    expected = ts.run_pipeline([(read_image(images[0]), read_image(images[1]))], config)
+    assert table["x1"].to_list() == expected.matches.keypoints1[:, 0].tolist()
+    assert table["cost"].to_list() == expected.matches.cost.tolist()
+    assert table["y0"].equals(table["y1"], check_names=False)
+    main([*command, "--sgbm.no-left-right"])
+    assert "cost" not in pl.read_parquet(out).columns
+    capsys.readouterr()
+    fails([*command, "--rectified", "auto"], capsys, "--rectified must be True where --matching.method is 'sgbm'")
+    fails([*command, "--matching.max-ratio", "0.8"], capsys, "--matching.max-ratio must be None where")
+    fails([*command, "--sgbm.num-disparities-px", "100"], capsys, "--sgbm.num-disparities-px must be a multiple of 16")
+    fails([*command, "--sgbm.step-penalty-levels", "40"], capsys, "must be less than --sgbm.jump-penalty-levels")
+
+
 def _printed(capsys: pytest.CaptureFixture) -> dict[str, str]:
     """What a command has printed, by name."""
     return dict(line.split() for line in capsys.readouterr().out.splitlines())

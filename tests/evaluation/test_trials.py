@@ -16,18 +16,20 @@ from tensor_stereo.configs import (
     MatchingConfig,
     Score,
     ScoreName,
+    SGBMConfig,
     SIFTConfig,
     TrialConfig,
     Verdict,
 )
 from tensor_stereo.datasets.synthetic.rendering import render_pair
 from tensor_stereo.evaluation import trials
+from tensor_stereo.evaluation.dataset import ROW_SCHEMA
 from tensor_stereo.evaluation.metrics import roc_auc, specificity_at_sensitivity
 from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES, TrialRunner, stage_keys
 from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.ops import backends
-from tensor_stereo.pipeline import run_pipeline, score_pairs
+from tensor_stereo.pipeline import map_pairs, run_pipeline, score_pairs
 from tensor_stereo.scores.domain import DomainWarning
 from tensor_stereo.scores.image_evidence import measure_images
 
@@ -35,6 +37,7 @@ PAIR = render_pair(0)
 PAPER = TrialConfig(verdict="cardinality")  # no score
 TOPOLOGY = TrialConfig(verdict="cardinality", score="topology")
 CONSENSUS = TrialConfig(score="consensus")
+DENSE = TrialConfig(verdict="cardinality", matching=MatchingConfig(method="sgbm"))
 TRIALS = [
     TrialConfig(),
     TOPOLOGY,
@@ -155,12 +158,45 @@ def test_rows_name_the_settings_of_the_score_that_ran_and_leave_the_others_null(
         assert {name: row[name] for name in columns} == (columns if score == "consensus" else dict.fromkeys(columns))
 
 
+def test_a_semi_global_map_is_shared_and_its_settings_stand_in_the_rows() -> None:
+    runner = TrialRunner(PAIR)
+    found = [runner.run(replace(DENSE, detector=name, verdict=verdict)) for name in ("fast", "gftt")
+             for verdict in ("adjacency", "cardinality")]  # fmt: skip
+    assert found[0].matches is found[1].matches
+    assert found[2].matches is found[3].matches
+    for trial in found:
+        alone = run_pipeline([(PAIR.image0, PAIR.image1)], trial.config).matches
+        for name in ("keypoints0", "keypoints1", "cost"):
+            assert torch.equal(getattr(trial.matches, name), getattr(alone, name)), name
+        assert trial.seconds.keys() == set(STAGES)
+        assert trial.seconds["match"] > 0
+    dense, sparse = found[0].row(), runner.run(TOPOLOGY).row()
+    assert (dense["method"], sparse["method"]) == ("sgbm", "ssd")
+    columns = {f"sgbm_{name}": value for name, value in vars(SGBMConfig()).items()}
+    assert {name: dense[name] for name in columns} == columns
+    assert {name: sparse[name] for name in columns} == dict.fromkeys(columns)
+    assert (dense["window_px"], sparse["window_px"]) == (None, 11)
+    assert dense.keys() <= ROW_SCHEMA.keys()
+    calls = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trials, "map_pairs", lambda *arguments: calls.append(0) or map_pairs(*arguments))
+        other = TrialRunner(PAIR)
+        for trial in found:
+            other.run(trial.config)
+        other.run(replace(DENSE, sgbm=SGBMConfig(mode="hh")))
+    assert len(calls) == 2
+
+
 @pytest.mark.parametrize(
     ("trial", "change", "first"),
     [
         (TOPOLOGY, {"fast": FASTConfig(window_px=9)}, "detect"),
         (TOPOLOGY, {"sift": SIFTConfig(max_keypoints=9)}, None),
         (TOPOLOGY, {"matching": MatchingConfig(mutual=True)}, "match"),
+        (TOPOLOGY, {"matching": MatchingConfig(method="sgbm")}, "match"),
+        (TOPOLOGY, {"sgbm": SGBMConfig(window_px=3)}, None),
+        (DENSE, {"sgbm": SGBMConfig(window_px=3)}, "match"),
+        (DENSE, {"matching": MatchingConfig(method="sgbm", max_disparity_px=20.0)}, "match"),
         (TOPOLOGY, {"backend": "scipy"}, "match"),
         (PAPER, {"backend": "scipy"}, "match"),
         (TOPOLOGY, {"max_error_px": 2.0}, None),

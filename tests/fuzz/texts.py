@@ -76,7 +76,7 @@ _VALUES = (
     '"none\\n"', '"\\u0000"', "1979-05-27T07:32:00Z", "07:32:00", "[]", "[[]]", "[1, 2]", '["none", 0.5]', "{}",
     "{ a = 1 }",
     "'''a\nb'''", '"""', "0x7fffffff", "0b1", "1_000", "+1", "9" * 5000, "1." + "0" * 500, "[true, 1]",
-    '"' + "x" * 5000 + '"',
+    '"' + "x" * 5000 + '"', '"sgbm"', '"3way"',
     '"opencv"', '"kornia"', '"edge"', '"px"', '"native"', '"reference"', '"ünï"', "'none'", "_", "=",
 )  # fmt: skip
 _SETTINGS = (
@@ -88,6 +88,8 @@ _SETTINGS = (
     "surf.initial_step_px", "surf.threshold", "surf.max_keypoints", "gftt.backend", "gftt.quality_level",
     "gftt.min_distance_px", "gftt.max_keypoints", "gftt.window_px", "matching.max_ratio", "matching.mutual",
     "matching.max_row_offset_px", "matching.min_disparity_px", "matching.max_disparity_px", "objects.element_px",
+    "matching.method", "sgbm.window_px", "sgbm.step_penalty_levels", "sgbm.jump_penalty_levels",
+    "sgbm.min_disparity_px", "sgbm.num_disparities_px", "sgbm.mode", "sgbm.left_right",
     "objects.min_area_px", "consensus.tolerance_px", "consensus.whole_tolerance_px", "consensus.row_tolerance_px",
     "consensus.whole_row_tolerance_px", "consensus.slope", "consensus.reach", "consensus.doubt",
     "consensus.cost_weight",

@@ -15,7 +15,7 @@ import polars as pl
 import torch
 from PIL import Image
 
-from tensor_stereo.configs import ConsensusConfig
+from tensor_stereo.configs import ConsensusConfig, SGBMConfig
 from tensor_stereo.evaluation.dataset import ROW_SCHEMA
 from tensor_stereo.evaluation.metrics import confusion_update, roc_update
 from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES
@@ -45,12 +45,14 @@ def make_grid(
         {
             "detector": detector,
             "feature_backend": "kornia" if detector in ("sift", "gftt") else None,
+            "method": "ssd",
             "window_px": 11 if detector in ("fast", "gftt") else None,
             "max_ratio": 0.8 if detector == "sift" else None,
             "mutual": False,
             "max_row_offset_px": 1.0,
             "min_disparity_px": 0.0,
             "max_disparity_px": 128.0,
+            **dict.fromkeys(f"sgbm_{f.name}" for f in fields(SGBMConfig)),
             "variant": variant,
             "verdict": verdict,
             "min_group_size": 4,

@@ -62,6 +62,9 @@ def test_an_empty_grid_is_the_default_trial(tmp_path: Path) -> None:
         {"verdict": "adjacency", "score": ["auto", "none"], "consensus": {"slope": [0.1, 0.3]}},
         {"verdict": "adjacency", "score": "topology", "consensus": {"slope": [0.1, 0.3]}},
         {"objects": {"element_px": [3, 5]}},
+        {"sgbm": {"window_px": [3, 5], "mode": ["3way", "hh"]}},
+        {"matching": {"method": "sgbm", "max_row_offset_px": ["none", 1]}, "fast": {"window_px": [7, 11]}},
+        {"matching": {"method": "sgbm"}, "detector": "sift", "sift": {"max_ratio": [0.6, 0.8, "none"]}},
     ],
 )
 def test_points_that_differ_only_in_unused_settings_are_one(unused: dict[str, object]) -> None:
@@ -78,6 +81,18 @@ def test_a_setting_of_consensus_is_an_axis_where_that_is_the_score() -> None:
     assert [(trial.score, trial.consensus.slope) for trial in both] == [
         ("none", default), ("learned", default), ("consensus", 0.1), ("topology", default), ("consensus", 0.3)
     ]  # fmt: skip
+
+
+def test_settings_of_semi_global_matching_are_axes_where_that_is_the_method(tmp_path: Path) -> None:
+    text = '[grid]\nmatching.method = ["ssd", "sgbm"]\nsgbm.window_px = [3, 5]\nsgbm.mode = "hh"\n'
+    found = _read(tmp_path, text).trials
+    assert [(trial.matching.method, trial.sgbm.window_px, trial.sgbm.mode) for trial in found] == [
+        ("ssd", 5, "3way"), ("sgbm", 3, "hh"), ("sgbm", 5, "hh")
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match=r"matching.method = sgbm, rectified = auto: rectified must be True where"):
+        _read(tmp_path, '[grid]\nmatching.method = ["ssd", "sgbm"]\nrectified = [true, "auto"]\n')
+    with pytest.raises(ValueError, match=r"num_disparities_px must be a multiple of 16"):
+        _read(tmp_path, "[grid]\nsgbm.num_disparities_px = [64, 100]\n")
 
 
 @pytest.mark.parametrize(

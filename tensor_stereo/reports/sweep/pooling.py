@@ -10,7 +10,7 @@ from typing import Any
 import polars as pl
 import torch
 
-from tensor_stereo.configs import DETECTORS, ConsensusConfig
+from tensor_stereo.configs import DETECTORS, ConsensusConfig, SGBMConfig
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, Confusion, ScoreCounts
 from tensor_stereo.evaluation.trials import SCORE_BINS
 from tensor_stereo.reports.sweep.results import COUNTS
@@ -28,12 +28,14 @@ class Setting:
 SETTINGS = {
     "detector": Setting("detector"),
     "feature_backend": Setting("features"),
+    "method": Setting("matching"),
     "window_px": Setting("window px"),
     "max_ratio": Setting("max. ratio", "off"),
     "mutual": Setting("mutual"),
     "max_row_offset_px": Setting("row offset px", "off"),
     "min_disparity_px": Setting("min. disparity px", "off"),
     "max_disparity_px": Setting("max. disparity px", "off"),
+    **{f"sgbm_{f.name}": Setting(f"SGBM {f.name.replace('_', ' ')}") for f in fields(SGBMConfig)},
     "variant": Setting("variant"),
     "verdict": Setting("verdict"),
     "min_group_size": Setting("min. group"),
@@ -59,14 +61,14 @@ PERTURBATIONS = ("outlier_rate", "noise_px")
 _BALANCED = (pl.col("sensitivity") + pl.col("specificity")) / 2
 
 
-_PARENTS = ("detector", "verdict", "score")  # on which other settings can depend
+_PARENTS = ("detector", "method", "verdict", "score")  # on which other settings can depend
 
 
 def telling_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of the settings that tell some rows apart; the rows may lack some settings.
 
-    One that follows from the detector, the verdict or the score, as a window that only FAST has, adds nothing and is
-    left out.
+    One that follows from the detector, the matching, the verdict or the score, as a window that only FAST has, adds
+    nothing and is left out.
 
     >>> row = dict.fromkeys(SETTINGS, 0)
     >>> telling_settings([row, row | {"score": 1, "temperature": 5.0}, row | {"noise_px": 2}])

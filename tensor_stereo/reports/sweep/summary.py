@@ -75,7 +75,7 @@ def settings_table(runs: Sequence[RunResults]) -> Table:
         values = pl.concat([run.results[name] for run in runs]).unique().sort(nulls_last=True).to_list()
         texts: list[str] = [setting_text(name, value) for value in values]
         more = f", ... ({len(texts)} values)" if len(texts) > _MAX_VALUES else ""
-        role = "varies" if name in varying else "follows detector or score" if len(texts) > 1 else "fixed"
+        role = "varies" if name in varying else "follows another" if len(texts) > 1 else "fixed"
         rows.append((SETTINGS[name].heading, role, ", ".join(texts[:_MAX_VALUES]) + more))
     return Table("Settings", ("setting", "role", "values"), tuple(rows))
 

@@ -183,6 +183,8 @@ class StepConfigs(FilterConfig):
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     sgbm: SGBMConfig = field(default_factory=SGBMConfig)  # of the matching method sgbm
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    repair: bool = False  # search rejected matches, and keypoints without one, again where kept ones say
+    refine: bool = False  # move kept matches to where the images fit best, to a fraction of a pixel
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -267,6 +269,7 @@ class EvaluationConfig(StepConfigs):
             trials.append(trial)
             no_cuts: dict[str, Any] = dict.fromkeys(CUTS)
             trial = replace(trial, verdict=self.restriction, score="none", **no_cuts)
+        trial = replace(trial, repair=False, refine=False)  # the paper's tables are of the matches as they come
         for constrained in (False, True):
             trials += [replace(trial, verdict=name, constrained=constrained) for name in RESTRICTIONS]
         return tuple(trials)

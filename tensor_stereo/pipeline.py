@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
-from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
+from tensor_stereo.classification import classify_graphs, mask_untested
 from tensor_stereo.configs import PipelineConfig, Rectified
 from tensor_stereo.dense.semi_global import SemiGlobalMaps, match_keypoints, match_semi_global
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
+from tensor_stereo.improving import improve_matches, judge_matches
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.scores.alignment import Alignment
@@ -24,7 +25,7 @@ from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Classification, Features, Matches
 
 ImagePair = tuple[Tensor, Tensor]
-STAGES = ("detect", "match", "group", "graph", "relate", "score")
+STAGES = ("detect", "match", "group", "graph", "relate", "score", "improve")
 
 
 @dataclass
@@ -59,6 +60,7 @@ class PipelineOutput:
             it takes none out.
         domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
             probability was calibrated on, 0 inside; None where there is no probability.
+        origin: (M,) int8, values of :class:`tensor_stereo.scores.Origin`: which matches were refined or repaired.
     """
 
     matches: Matches
@@ -69,6 +71,7 @@ class PipelineOutput:
     cumulative: Tensor | None = None
     alignment: Alignment | None = None
     domain: Tensor | None = None
+    origin: Tensor | None = None
 
     def probability(self, max_error_px: float) -> Tensor:
         """(M,) calibrated probability of an error of at most ``max_error_px``, from .5 to 5 px, without another run.
@@ -107,20 +110,39 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
     """
     watch = Stopwatch()
     gray = to_gray_pairs(pairs, rectified=config.rectified)
-    matches = match_pairs(gray, config, watch)
+    keypoints, matches = find_matches(gray, config, watch)
     if config.constrained:
         matches = group_pairs(gray, matches, config, watch)
     with watch.measure("graph"):
         graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
+
+    def score(matches: Matches, graphs: MatchGraphs) -> ScoredMatches | None:
+        return score_pairs(gray, matches, graphs, config)
+
+    def group(matches: Matches) -> Matches:
+        return group_pairs(gray, matches, config, Stopwatch()) if config.constrained else matches
+
     with watch.measure("relate"):
-        verdicts = classify_graphs(graphs, config)
+        verdict = classify_graphs(graphs, config)
     with watch.measure("score"):
-        found = score_pairs(gray, matches, graphs, config)
-        if found is None:
-            return PipelineOutput(matches, graphs, verdicts, None, watch.seconds)
-        verdicts, score = apply_score(verdicts, found.score, matches.ptr, config)
-        cumulative = mask_untested(found.cumulative, verdicts)
-    return PipelineOutput(matches, graphs, verdicts, score, watch.seconds, cumulative, found.alignment, found.domain)
+        judged = judge_matches(matches, graphs, config, score, verdict)
+    with watch.measure("improve"):
+        views = [pair[0][0] for pair in gray], [pair[1][0] for pair in gray]
+        judged = improve_matches(judged, views, keypoints, config, score, group)
+    found = judged.found
+    if found is None:
+        return PipelineOutput(judged.matches, judged.graphs, judged.verdict, None, watch.seconds, origin=judged.origin)
+    return PipelineOutput(
+        judged.matches,
+        judged.graphs,
+        judged.verdict,
+        judged.score,
+        watch.seconds,
+        mask_untested(found.cumulative, judged.verdict),
+        found.alignment,
+        found.domain,
+        judged.origin,
+    )
 
 
 def to_gray_pairs(pairs: Sequence[ImagePair], *, rectified: Rectified = True) -> list[ImagePair]:
@@ -140,15 +162,20 @@ def to_gray_pairs(pairs: Sequence[ImagePair], *, rectified: Rectified = True) ->
 
 def match_pairs(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwatch) -> Matches:
     """Features of every image that needs them, then the putative matches of every pair."""
+    return find_matches(gray, config, watch)[1]
+
+
+def find_matches(gray: Sequence[ImagePair], config: PipelineConfig, watch: Stopwatch) -> tuple[Features, Matches]:
+    """Features of view 0, and the putative matches, of every pair."""
     if config.matching.method == "sgbm":
         with watch.measure("detect"):
             keypoints = concatenate_features(detect_images([pair[0] for pair in gray], config))
         with watch.measure("match"):
-            return match_keypoints(keypoints, map_pairs(gray, config), config.matching)
+            return keypoints, match_keypoints(keypoints, map_pairs(gray, config), config.matching)
     with watch.measure("detect"):
         features0, features1 = detect_pairs(gray, config)
     with watch.measure("match"):
-        return match_features(features0, features1, config)
+        return features0, match_features(features0, features1, config)
 
 
 def detect_pairs(gray: Sequence[ImagePair], config: PipelineConfig) -> tuple[Features, Features]:

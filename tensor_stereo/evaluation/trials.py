@@ -10,19 +10,21 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from tensor_stereo.classification import apply_score, classify_graphs
+from tensor_stereo.classification import classify_graphs
 from tensor_stereo.configs import CUTS, TrialConfig
 from tensor_stereo.dense.semi_global import match_keypoints
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, roc_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
 from tensor_stereo.evaluation.truth import errors_against_gt
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
+from tensor_stereo.improving import Judged, improve_matches, judge_matches
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.pipeline import STAGES as PIPELINE_STAGES
-from tensor_stereo.pipeline import Stopwatch, detect_pairs, map_pairs, score_pairs, to_gray_pairs
+from tensor_stereo.pipeline import Stopwatch, detect_pairs, group_pairs, map_pairs, score_pairs, to_gray_pairs
+from tensor_stereo.scores.by_name import ScoredMatches
 from tensor_stereo.scores.domain import describe_domain
-from tensor_stereo.types import Classification, Matches, Relation, StereoPair
+from tensor_stereo.types import Classification, Features, Matches, Relation, StereoPair
 
 STAGES = (*PIPELINE_STAGES[:2], "perturb", *PIPELINE_STAGES[2:])
 SCORE_BINS = 128  # equal bins of [0, 1] in which the rows count scores
@@ -130,6 +132,8 @@ def setting_columns(config: TrialConfig) -> dict[str, Any]:
         "max_disparity_px": config.matching.max_disparity_px,
         **{f"sgbm_{name}": value if is_dense else None for name, value in vars(config.sgbm).items()},
         "variant": "constrained" if config.constrained else "unconstrained",
+        "repair": config.repair,
+        "refine": config.refine,
         "verdict": config.verdict,
         "min_group_size": config.min_group_size,
         "tie_tolerance": config.tie_tolerance,
@@ -178,6 +182,9 @@ def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
         "learned": trial.rectified,
     }
     keys["score"] = keys["graph"], trial.resolved_score, used.get(trial.resolved_score)
+    decides = trial.verdict, *(getattr(trial, name) for name in CUTS), trial.max_error_px
+    asked = trial.repair, trial.refine
+    keys["improve"] = (keys["relate"], keys["score"], decides, asked) if any(asked) else None
     return keys
 
 
@@ -249,16 +256,35 @@ class TrialRunner:
             "relate",
             lambda: classify_graphs(graphs, trial),
         )
-        score = domain = is_rectified = found = None
+        found = None
         if trial.resolved_score != "none":
             found = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
+        if found is not None:  # it may be that of another tolerance
+            found = found._replace(score=found.within(trial.max_error_px).to(found.score.dtype))
+        judged = judge_matches(matches, graphs, trial, lambda *_: found, verdict)
+        if trial.repair or trial.refine:
+            given = judged
+            judged, error_px = share("improve", lambda: self._improve(given, features[0], trial))
+            correct, valid = error_px <= trial.max_error_px, ~error_px.isnan()
+        found, domain, is_rectified = judged.found, None, None
         if found is not None:
-            score = found.within(trial.max_error_px).to(found.score.dtype)  # it may be that of another tolerance
-            verdict, score = apply_score(verdict, score, matches.ptr, trial)
             domain = None if found.domain is None else int(found.domain)
             is_rectified = None if found.alignment is None else bool(found.alignment.rectified)
-        known = graphs, verdict, score, domain, is_rectified, seconds
-        return Trial(self.pair, trial, matches, correct, valid, *known)
+        known = judged.graphs, judged.verdict, judged.score, domain, is_rectified, seconds
+        return Trial(self.pair, trial, judged.matches, correct, valid, *known)
+
+    def _improve(self, judged: Judged, keypoints: Features, trial: TrialConfig) -> tuple[Judged, Tensor]:
+        """What repair and refinement leave, and how far it is from ground truth."""
+        views = [self._gray[0][0][0]], [self._gray[0][1][0]]
+
+        def group(matches: Matches) -> Matches:
+            return group_pairs(self._gray, matches, trial, Stopwatch()) if trial.constrained else matches
+
+        def score(matches: Matches, graphs: MatchGraphs) -> ScoredMatches | None:
+            return score_pairs(self._gray, matches, graphs, trial)
+
+        improved = improve_matches(judged, views, keypoints, trial, score, group)
+        return improved, self._errors(improved.matches)
 
     def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor]:
         """The matches as the setting wants them, and how far they are from ground truth, NaN where it is unknown."""
@@ -270,9 +296,13 @@ class TrialRunner:
         if trial.noise_px:
             height, width = self.pair.image0.shape[1:]
             matches = add_noise(matches, trial.noise_px, generator, [(height, width)])
+        return matches, self._errors(matches)
+
+    def _errors(self, matches: Matches) -> Tensor:
+        """(M,) px from ground truth, NaN where it is unknown."""
         if self.pair.disparity_gt is None:
-            return matches, torch.full((matches.num_matches,), torch.nan)
-        return matches, errors_against_gt(matches, [self.pair.disparity_gt])
+            return torch.full((matches.num_matches,), torch.nan)
+        return errors_against_gt(matches, [self.pair.disparity_gt])
 
 
 def scene_name(pair: StereoPair) -> str:

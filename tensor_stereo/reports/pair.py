@@ -22,6 +22,7 @@ from tensor_stereo.objects import trace_objects
 from tensor_stereo.paths import TABLES, check_apart, has_ending, prepare_target
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
+from tensor_stereo.scores import Origin
 from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.table_files import write_table
 from tensor_stereo.types import Relation
@@ -141,7 +142,8 @@ def match_table(
     Columns: ``x0, y0, x1, y1, disparity`` in px, ``cost``, ``group`` if the run was constrained; ``inlier``, what the
     verdict of the settings says; ``probability`` of an error of at most ``max_error_px``, or ``score`` where that
     is none; ``inlier_adjacency``, ``inlier_cardinality`` and, if there is a score that can decide, ``inlier_score``;
-    ``relation`` by name, ``overlap, degree0, degree1``; beside a probability ``domain``, in every row why the pair lies
+    ``relation`` by name, ``overlap, degree0, degree1``; ``origin`` by name (given, refined, repaired) if the settings
+    ask for either; beside a probability ``domain``, in every row why the pair lies
     outside of what it was calibrated on, empty inside; and with ``truth`` = (correct, valid) also ``correct``, null
     where ground truth is not known. ``config`` is that of the output; None means the defaults.
     """
@@ -166,6 +168,10 @@ def match_table(
     table = pl.DataFrame({name: column.numpy() for name, column in columns.items() if column is not None})
     names = {relation.value: relation.name.lower() for relation in Relation}
     table = table.with_columns(pl.col("relation").replace_strict(names, return_dtype=pl.String))
+    if config.repair or config.refine:
+        origins = {one.value: one.name.lower() for one in Origin}
+        found = pl.Series("origin", None if output.origin is None else output.origin.numpy())
+        table = table.with_columns(found.replace_strict(origins, return_dtype=pl.String))
     if output.domain is not None:
         table = table.with_columns(pl.lit(describe_domain(int(output.domain)), pl.String).alias("domain"))
     if truth is None:

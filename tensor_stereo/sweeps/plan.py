@@ -72,6 +72,7 @@ class Plan:
             trials = [self.config.trials[k] for k in group]
             keys = [stage_keys(trial) for trial in trials]
             runs = {stage: len({key[stage] for key in keys}) for stage in STAGES}
+            runs["improve"] = len({key["improve"] for key in keys if key["improve"] is not None})
             runs["group"] = len({key["group"] for key in keys if "label" in key})
             runs["score"] = len(
                 {key["score"] for key, t in zip(keys, trials, strict=True) if t.resolved_score != "none"}

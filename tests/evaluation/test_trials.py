@@ -230,11 +230,29 @@ def test_a_setting_changes_the_stages_from_its_own_on(
     trial: TrialConfig, change: dict[str, object], first: str | None
 ) -> None:
     before, after = stage_keys(trial), stage_keys(replace(trial, **change))
+    assert before["improve"] is after["improve"] is None  # not asked for
     changed = [stage for stage in STAGES if before[stage] != after[stage]]
-    after_first = [] if first is None else list(STAGES[STAGES.index(first) :])
+    after_first = [] if first is None else list(STAGES[STAGES.index(first) : -1])
     if first == "relate":
         after_first.remove("score")  # the score knows no restriction and no least group
     assert changed == after_first
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"refine": True},
+        {"repair": True, "refine": False},
+        {"threshold": 0.3},
+        {"max_error_px": 2.0},
+        {"verdict": "adjacency"},
+    ],
+)
+def test_what_is_repaired_depends_on_all_that_decides(change: dict[str, object]) -> None:
+    trial = TrialConfig(repair=change.get("repair") is None, score="consensus")
+    before, after = stage_keys(trial), stage_keys(replace(trial, **change))
+    assert before["score"] == after["score"]
+    assert before["improve"] != after["improve"]
 
 
 def test_all_verdicts_share_features_matches_graphs_and_score() -> None:

@@ -54,6 +54,8 @@ def make_grid(
             "max_disparity_px": 128.0,
             **dict.fromkeys(f"sgbm_{f.name}" for f in fields(SGBMConfig)),
             "variant": variant,
+            "repair": False,
+            "refine": False,
             "verdict": verdict,
             "min_group_size": 4,
             "tie_tolerance": 1e-3,

@@ -37,6 +37,8 @@ SETTINGS = {
     "max_disparity_px": Setting("max. disparity px", "off"),
     **{f"sgbm_{f.name}": Setting(f"SGBM {f.name.replace('_', ' ')}") for f in fields(SGBMConfig)},
     "variant": Setting("variant"),
+    "repair": Setting("repair"),
+    "refine": Setting("refine"),
     "verdict": Setting("verdict"),
     "min_group_size": Setting("min. group"),
     "tie_tolerance": Setting("tie tolerance"),

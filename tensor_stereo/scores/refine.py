@@ -1,8 +1,8 @@
 """Refine: kept matches move to where the windows of both views fit best, to a fraction of a pixel.
 
 Windows lie half-way along the slope of the surface in either view. Gauss-Newton steps along the epipolar line minimise
-the zero-mean sum of squared differences, over pixels like the centre; believed neighbours then say how far the minimum
-is to be trusted (maximum a posteriori, their planes being the prior).
+the zero-mean sum of squared differences, over pixels near the centre and like it. Believed neighbours then say how far
+the minimum is to be trusted (maximum a posteriori, their planes being the prior).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tensor_stereo.graphs import MatchGraphs, build_match_graphs, check_match_gr
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, epipolar_frames, map_points, no_alignment
 from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs
 from tensor_stereo.scores.slopes import estimate_slopes
-from tensor_stereo.scores.windows import LIKE, NOISE_VARIANCE, RADIUS_PX, window_kernels
+from tensor_stereo.scores.windows import NOISE_VARIANCE, RADIUS_PX, TIGHT, window_kernels
 from tensor_stereo.types import Matches, check_mask, check_vector
 
 _STEPS = 4
@@ -26,7 +26,7 @@ _STEP_PX = 0.5  # the longest
 _APART_PX = 0.25  # of the samples that give the slope of the grey levels
 _DAMPING = 1.0  # grey levels squared per px squared; flat windows stay
 _NUM_PIXELS = 40.0  # that tell independently, of a window
-_DISTRUST = 4.0  # times the variance that noise alone would give a minimum
+_DISTRUST = 16.0  # times the variance that noise alone would give a minimum
 _PRIOR_PX, _PRIOR_SLOPE, _PRIOR_REACH_PX, _PRIOR_MISS_PX = 0.1, 0.01, 25.0, 0.5
 _ROWS_AT_ONCE = 512
 
@@ -130,7 +130,7 @@ def _minimise(looks: Sequence[Sampler], places: Place, max_shift_px: float) -> t
     """(m,) shifts along and across the line, and the variance of the first."""
     half = places.slope / 2
     windows = looks[0].slanted(places.left, RADIUS_PX, half)
-    kernel = window_kernels(windows)[..., LIKE].reshape_as(windows)
+    kernel = window_kernels(windows)[..., TIGHT].reshape_as(windows)
 
     def differ(along: Tensor, across: Tensor) -> Tensor:
         other = looks[1].slanted(looks[1].place(places.right, along, across), RADIUS_PX, -half)

@@ -21,7 +21,7 @@ from tensor_stereo.scores.image_evidence import MAX_DISPARITIES
 from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.scores.windows import LIKE, NUM_WHOLE, RADIUS_PX, TIGHT, compare_windows, window_kernels
-from tensor_stereo.types import Matches, check_mask, check_vector
+from tensor_stereo.types import Matches, check_mask, check_points, check_ptr, check_vector
 
 _LEAST_KEPT = 4  # matches of a pair that predict for others
 _NUM_NEIGHBORS = 8
@@ -121,13 +121,13 @@ def _free_keypoints(matches: Matches, keypoints0: Tensor | None, ptr0: Tensor | 
     """(N', 2) distinct keypoints that no match of their pair has, and (N',) their pairs."""
     if keypoints0 is None:
         return matches.keypoints0[:0].double(), matches.ptr[:0]
+    check_points("keypoints0", keypoints0)
     if ptr0 is None and matches.num_pairs != 1:
         raise ValueError(f"ptr0 must be given with keypoints0 of {matches.num_pairs} pairs")
     ptr0 = matches.ptr.new_tensor([0, len(keypoints0)]) if ptr0 is None else ptr0
-    if ptr0.shape != matches.ptr.shape or int(ptr0[0]) != 0 or int(ptr0[-1]) != len(keypoints0):
-        raise ValueError(
-            f"ptr0 must be offsets of {len(keypoints0)} keypoints in {matches.num_pairs} pairs, got {ptr0}"
-        )
+    check_ptr("ptr0", ptr0, len(keypoints0))
+    if ptr0.shape != matches.ptr.shape:
+        raise ValueError(f"ptr0 must be offsets of {matches.num_pairs} pairs, got those of {len(ptr0) - 1}")
     batch = torch.cat([ptr_to_batch(matches.ptr), ptr_to_batch(ptr0)])
     points = torch.cat([matches.keypoints0.double(), keypoints0.double()])
     _, first_of = torch.unique(torch.cat([batch[:, None].double(), points], 1), dim=0, return_inverse=True)

@@ -118,7 +118,11 @@ def test_wrong_arguments_are_named() -> None:
     two = collate_matches([matches, matches])
     with pytest.raises(ValueError, match="ptr0 must be given"):
         repair_matches(two, *images(0, 0), torch.cat([is_right, is_right]), keypoints0=matches.keypoints0)
-    with pytest.raises(ValueError, match="ptr0 must be offsets"):
+    with pytest.raises(ValueError, match=r"keypoints0 must have shape \(N, 2\)"):
+        repair_matches(matches, *views, is_right, keypoints0=matches.keypoints0[:, 0])
+    with pytest.raises(ValueError, match="ptr0 must be offsets of 1 pairs"):
+        repair_matches(matches, *views, is_right, keypoints0=matches.keypoints0[:4], ptr0=torch.tensor([0, 2, 4]))
+    with pytest.raises(ValueError, match="ptr0"):
         repair_matches(
             matches, *views, is_right, keypoints0=matches.keypoints0, ptr0=torch.tensor([0, matches.num_matches - 1])
         )

@@ -49,7 +49,7 @@ class PipelineOutput:
 
     Attributes:
         matches: the putative matches of all pairs, with ``group`` if the run was constrained.
-        graphs: their Delaunay graphs.
+        graphs: their Delaunay graphs, as they were judged: before refinement.
         classification: one verdict per match.
         score: (M,), higher is better, 0 for untested matches; None if the settings ask for none. ``learned``, the
             default, and ``consensus`` are the calibrated probability of an error of at most ``max_error_px``.

@@ -17,10 +17,11 @@ import numpy as np
 import torch
 
 from tensor_stereo.configs import FilterConfig, PipelineConfig, SGBMConfig
-from tensor_stereo.datasets import find_pairs, read_disparity_png
+from tensor_stereo.datasets import find_pairs, read_disparity_png, render_pair
 from tensor_stereo.dense.partners import sample_disparity
 from tensor_stereo.dense.semi_global import match_semi_global
 from tensor_stereo.evaluation import errors_against_gt
+from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.pipeline import Stopwatch, find_matches
 from tensor_stereo.scores import LearnedScore, load_learned, refine_matches, repair_matches, score_matches
 
@@ -34,6 +35,7 @@ from training.scenes import fold_of
 from training.work_folder import load_fold_networks
 
 DETECTORS = ("fast", "gftt", "sift")
+NUM_RENDERED = 40
 PRECISIONS = (0.90, 0.95, 0.98)
 TOLERANCE_PX, LIKELY = 1.0, 0.5
 TWINS = {"disp2.png": "disp6.png", "disp1.png": "disp5.png"}
@@ -141,6 +143,33 @@ def report(
         suite.note(f"{group}, {detector}, {name}", **means)
 
 
+def report_locking(suite: Suite, detector: str) -> None:
+    """Bias of refined matches by the fraction of their disparity, on rendered scenes, whose truth is exact.
+
+    Right matches are rounded to whole px of disparity and refined; those that end within half a px count.
+    """
+    found = []
+    for seed in range(NUM_RENDERED):
+        pair = render_pair((2016, seed))
+        points = (
+            detect_features(to_gray(pair.image0[None]), PipelineConfig(detector=detector)).keypoints.double().round()
+        )
+        x, y = points.long().unbind(1)
+        disparity = pair.disparity_gt[y, x].double()
+        seen = ~pair.occluded[y, x] & (points[:, 0] - disparity > 8)
+        points, disparity = points[seen], disparity[seen]
+        right = points - torch.stack([disparity.round(), torch.zeros_like(disparity)], 1)
+        matches = Matches(points, right, torch.tensor([0, len(points)]))
+        kept = torch.ones(len(points), dtype=torch.bool)
+        moved = refine_matches(matches, [pair.image0], [pair.image1], kept)
+        found.append(torch.stack([disparity - disparity.floor(), points[:, 0] - disparity - moved.keypoints1[:, 0]]))
+    fraction, error = torch.cat(found, 1)
+    near = error.abs() < 0.5
+    tenth = (10 * fraction).long().clamp(0, 9)
+    bias = {f"bias_at_0.{k}5": float(error[near & (tenth == k)].mean()) for k in range(10)}
+    suite.note(f"pixel locking, {detector}", median_error_px=float(error.abs().median()), **bias)
+
+
 @torch.no_grad()
 def main() -> None:
     suite = Suite(
@@ -160,6 +189,8 @@ def main() -> None:
         networks = [shipped if group == "eight" else folds[fold_of(pair.scene)] for pair in pairs]
         for detector in DETECTORS:
             report(suite, title, detector, pairs, networks, twins)
+    for detector in DETECTORS[:2]:
+        report_locking(suite, detector)
     suite.write()
 
 

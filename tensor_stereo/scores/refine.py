@@ -16,11 +16,12 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs, check_match_graphs
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, epipolar_frames, map_points, no_alignment
-from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs
+from tensor_stereo.scores.samplers import Place, Sampler, blur, find_places, look_at_pairs
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.scores.windows import NOISE_VARIANCE, RADIUS_PX, TIGHT, window_kernels
 from tensor_stereo.types import Matches, check_mask, check_vector
 
+_BLUR = 1.4  # as in so many times fewer pixels; interpolation then smooths all places alike, which locks no pixel
 _STEPS = 4
 _STEP_PX = 0.5  # the longest
 _APART_PX = 0.25  # of the samples that give the slope of the grey levels
@@ -115,7 +116,8 @@ def _find_shifts(
     found = [torch.zeros(matches.num_matches, device=matches.ptr.device) for _ in range(3)]
     offsets = matches.ptr.tolist()
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
-        for b, (samplers, own) in enumerate(look_at_pairs(views, matches, places, alignment)):
+        for b, (sharp, own) in enumerate(look_at_pairs(views, matches, places, alignment)):
+            samplers = [sampler._replace(image=blur(sampler.image, _BLUR)) for sampler in sharp]
             for rows in kept[offsets[b] : offsets[b + 1]].nonzero()[:, 0].split(_ROWS_AT_ONCE):  # type: ignore[no-untyped-call]
                 looks = [sampler.select(rows) for sampler in samplers]
                 for whole, part in zip(found, _minimise(looks, own.select(rows), max_shift_px), strict=True):

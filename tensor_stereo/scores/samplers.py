@@ -245,7 +245,7 @@ def warp_view(image0: Tensor, image1: Tensor, to_view0: Tensor, keypoints1: Tens
     origin = low.floor()
     width, height = (high - origin).ceil().clamp(min=1).long().tolist()
     finer = _finer(to_view0, keypoints1)
-    image0, image1 = _blur(image0, 1 / finer), _blur(image1, finer)
+    image0, image1 = blur(image0, 1 / finer), blur(image1, finer)
     m = torch.linalg.inv_ex(to_view0)[0]
     x = torch.arange(width, dtype=torch.float64, device=origin.device) + origin[0]
     parts = []
@@ -271,8 +271,13 @@ def _finer(to_view0: Tensor, keypoints1: Tensor) -> float:
     return 1 / math.sqrt(min(max(area, 1e-4), 1e4))
 
 
-def _blur(image: Tensor, px_per_px: float) -> Tensor:
-    """The image as sharp as if it had that many times fewer pixels a side; itself if it has not more."""
+def blur(image: Tensor, px_per_px: float) -> Tensor:
+    """The image (H, W) as sharp as if it had that many times fewer pixels a side; itself if it has not more.
+
+    >>> image = torch.rand(9, 9)
+    >>> blur(image, 0.5) is image, bool(blur(image, 2.0).std() < image.std())
+    (True, True)
+    """
     sigma = 0.5 * math.sqrt(max(px_per_px**2 - 1, 0.0))
     if sigma < _LEAST_BLUR_PX:
         return image

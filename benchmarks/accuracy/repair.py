@@ -24,6 +24,7 @@ from tensor_stereo.evaluation import errors_against_gt
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.pipeline import Stopwatch, find_matches
 from tensor_stereo.scores import LearnedScore, load_learned, refine_matches, repair_matches, score_matches
+from tensor_stereo.types import Matches
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from accuracy.putatives import GrayPair, load_pairs

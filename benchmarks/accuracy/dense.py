@@ -19,7 +19,7 @@ import tensor_stereo as ts
 from tensor_stereo.datasets import find_pairs, read_calibration
 from tensor_stereo.dense import interpolate_disparity
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.scores import LearnedScore, consensus_belief, load_learned, measure_images
+from tensor_stereo.scores import TOLERANCES_PX, LearnedScore, consensus_belief, load_learned, measure_images
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from accuracy.dense_figures import draw_bars, draw_maps
@@ -59,7 +59,7 @@ def score_filters(pair: GrayPair, one: Putatives, network: LearnedScore) -> Scor
     ours = {
         "topology": ts.DelaunayFilter(verdict="cardinality", score="topology")(plain).score,
         "consensus": consensus_belief(given, graphs),
-        "learned": network(given, graphs, measure_images(*views, given, graphs))[1],
+        "learned": network(given, graphs, measure_images(*views, given, graphs))[1][:, TOLERANCES_PX.index(1)],
         "paper R1+R2": ts.classify_matches(plain, min_group_size=1).inlier,
         "none": torch.ones(plain.num_matches),
         "oracle": torch.from_numpy(one.correct & one.valid),

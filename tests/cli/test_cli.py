@@ -12,11 +12,12 @@ import pytest
 import torch
 
 import tensor_stereo as ts
-from tensor_stereo.cli import _parse, main
+from tensor_stereo.cli import main
 from tensor_stereo.configs import RESTRICTIONS, VERDICTS
 from tensor_stereo.datasets import read_image
 from tensor_stereo.datasets.synthetic.rendering import render_pair
 from tests.cli.failing import fails
+from tests.cli.printed import printed_values
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def test_classify_writes_every_match(scene: Path, tmp_path: Path, ending: str, c
     main(["classify", str(scene / "im0.png"), str(scene / "im1.png"), "--out", str(out), "--constrained",
           "--disparity-gt", str(scene / "disp0.pfm"), "--figure", str(figure)])  # fmt: skip
     table = pl.read_csv(out) if ending == "csv" else pl.read_parquet(out)
-    printed = _printed(capsys)
+    printed = printed_values(capsys)
     assert int(printed["num_matches"]) == table.height > 100
     assert int(printed["num_kept"]) == table["inlier"].sum()
     assert int(printed["num_untested"]) == (table["relation"] == "untested").sum() > 0
@@ -115,14 +116,14 @@ def test_a_verdict_of_the_paper_pays_for_no_score_and_shows_one_that_is_asked_fo
     out, figure = tmp_path / "matches.parquet", tmp_path / "figure.png"
     command = ["classify", str(scene / "im0.png"), str(scene / "im1.png"), "--out", str(out), "--verdict", verdict]
     main([*command, "--figure", str(figure)])
-    plain, printed = pl.read_parquet(out), _printed(capsys)
+    plain, printed = pl.read_parquet(out), printed_values(capsys)
     assert not {"score", "probability", "inlier_score"} & set(plain.columns)
     assert {"relation", "inlier_adjacency", "inlier_cardinality"} <= set(plain.columns)
     assert "kept_by_score" not in printed
     assert int(printed["num_kept"]) == int(printed[f"kept_by_{verdict}"]) == plain["inlier"].sum()
     assert figure.stat().st_size > 0
     main([*command, "--score", "consensus"])
-    table, printed = pl.read_parquet(out), _printed(capsys)
+    table, printed = pl.read_parquet(out), printed_values(capsys)
     assert table.select(plain.columns).equals(plain)
     assert set(table.columns) - set(plain.columns) == {"probability", "inlier_score", "domain"}
     assert table["domain"].unique().to_list() == [""]
@@ -130,7 +131,7 @@ def test_a_verdict_of_the_paper_pays_for_no_score_and_shows_one_that_is_asked_fo
     assert table["inlier_score"].equals((table["probability"] >= 0.5) & (table["relation"] != "untested"))
     assert int(printed["kept_by_score"]) == table["inlier_score"].sum() != int(printed["num_kept"])
     main([*command, "--score", "topology"])  # no probability, so it decides nothing
-    table, printed = pl.read_parquet(out), _printed(capsys)
+    table, printed = pl.read_parquet(out), printed_values(capsys)
     assert set(table.columns) - set(plain.columns) == {"score"}
     assert not {"kept_by_score", "domain"} & set(printed)
 
@@ -182,11 +183,6 @@ def test_semi_global_matching_has_flags(scene: Path, tmp_path: Path, capsys: pyt
     fails([*command, "--matching.max-ratio", "0.8"], capsys, "--matching.max-ratio must be None where")
     fails([*command, "--sgbm.num-disparities-px", "100"], capsys, "--sgbm.num-disparities-px must be a multiple of 16")
     fails([*command, "--sgbm.step-penalty-levels", "40"], capsys, "must be less than --sgbm.jump-penalty-levels")
-
-
-def _printed(capsys: pytest.CaptureFixture) -> dict[str, str]:
-    """What a command has printed, by name."""
-    return dict(line.split() for line in capsys.readouterr().out.splitlines())
 
 
 def test_a_scaled_png_is_the_same_ground_truth(scene: Path, capsys: pytest.CaptureFixture) -> None:
@@ -370,7 +366,7 @@ def test_classify_marks_a_pair_of_two_scenes(tmp_path: Path, capsys: pytest.Capt
     for k, view in enumerate(views):
         cv2.imwrite(str(tmp_path / f"{k}.png"), view[0].numpy())
     main(["classify", str(tmp_path / "0.png"), str(tmp_path / "1.png"), "--out", str(tmp_path / "matches.csv")])
-    assert _printed(capsys)["domain"] == "agreement"
+    assert printed_values(capsys)["domain"] == "agreement"
     assert pl.read_csv(tmp_path / "matches.csv")["domain"].unique().to_list() == ["agreement"]
 
 
@@ -379,70 +375,11 @@ def test_every_command_takes_the_tolerance(scene: Path, tmp_path: Path, capsys: 
     kept = []
     for px in ("0.5", "1", "5"):
         main(["classify", *files, "--max-error-px", px, "--out", str(out)])
-        kept.append(int(_printed(capsys)["num_kept"]))
+        kept.append(int(printed_values(capsys)["num_kept"]))
         main(["filter", str(out), "--out", str(tmp_path / "kept.parquet"), "--max-error-px", px])
-        assert int(_printed(capsys)["num_kept"]) > 0
+        assert int(printed_values(capsys)["num_kept"]) > 0
     assert kept == sorted(kept)
     command = ["evaluate", str(scene.parent.parent), "--detectors", "fast", "--scenes", "RENDERED"]
     main([*command, "--max-error-px", "3"])
     assert "learned, probability 0.5 within 3 px (S)" in capsys.readouterr().out
     fails(["classify", *files, "--max-error-px", "9"], capsys, "--max-error-px", "[0.5, 5]")
-
-
-@pytest.mark.parametrize(("word", "value"), [("True", True), ("False", False), ("auto", "auto")])
-def test_every_command_takes_rectified(word: str, value: object) -> None:
-    for command in (["classify", "a.png", "b.png"], ["evaluate", "a"], ["filter", "a.csv", "--out", "b.csv"]):
-        found = _parse([*command, "--rectified", word]).config.rectified
-        assert found == value
-        assert type(found) is type(value)
-        assert _parse(command).config.rectified == ("auto" if command[0] == "filter" else True)
-
-
-@pytest.mark.parametrize("command", ["classify", "evaluate", "filter"])
-def test_the_help_names_the_values_of_rectified(command: str, capsys: pytest.CaptureFixture) -> None:
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
-    assert "--rectified {True,False,auto}" in capsys.readouterr().out
-    for value in ("1", "yes", "true"):
-        with pytest.raises(SystemExit) as stop:
-            main([command, "a.csv", "--rectified", value])
-        assert stop.value.code == 2
-        assert "--rectified" in capsys.readouterr().err
-
-
-def test_classify_says_what_auto_took_the_pair_for(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    pair = render_pair(0)
-    height, width = pair.image0.shape[-2:]
-    turn = cv2.getRotationMatrix2D((width / 2, height / 2), 15, 1)
-    cv2.imwrite(str(tmp_path / "left.png"), pair.image0[0].numpy())
-    cv2.imwrite(str(tmp_path / "right.png"), pair.image1[0].numpy())
-    cv2.imwrite(str(tmp_path / "turned.png"), cv2.warpAffine(pair.image0[0].numpy(), turn, (width, height)))
-    left, right, turned = (str(tmp_path / f"{name}.png") for name in ("left", "right", "turned"))
-    kept = []
-    for other, expected in ((right, "yes"), (turned, "no")):
-        main(["classify", left, other, "--detector", "sift", "--rectified", "auto"])
-        printed = _printed(capsys)
-        assert printed["rectified"] == expected
-        kept.append(int(printed["num_kept"]))
-        known = "True" if expected == "yes" else "False"
-        main(["classify", left, other, "--detector", "sift", "--rectified", known])
-        printed = _printed(capsys)
-        assert "rectified" not in printed
-        assert int(printed["num_kept"]) == kept[-1]
-    assert min(kept) > 100
-    main(["classify", left, right, "--verdict", "cardinality", "--rectified", "auto"])  # which asks for no rows
-    assert "rectified" not in _printed(capsys)
-
-
-def test_filter_counts_the_pairs_that_it_takes_for_rectified(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    points = np.random.default_rng(0).random((3, 200, 2)) * [320, 240]
-    others = points - [5.0, 0.0]
-    others[1] = points[1] @ np.array([[0.8, -0.6], [0.6, 0.8]])
-    matches = tmp_path / "m.npz"
-    rows = {"keypoints0": points.reshape(-1, 2), "keypoints1": others.reshape(-1, 2)}
-    np.savez(matches, **rows, ptr=np.arange(4) * 200)
-    main(["filter", str(matches), "--out", str(tmp_path / "out.npz")])
-    printed = _printed(capsys)
-    assert (printed["num_pairs"], printed["num_rectified"]) == ("3", "2")
-    main(["filter", str(matches), "--out", str(tmp_path / "out.npz"), "--verdict", "cardinality"])
-    assert "num_rectified" not in _printed(capsys)

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from tensor_stereo.batching import select_matches
 from tensor_stereo.configs import FilterConfig
-from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.scores.alignment import Alignment, estimate_alignment
-from tensor_stereo.scores.refine import refine_matches
-from tensor_stereo.scores.repair import Origin, repair_matches
+from tensor_stereo.scores.refine import mark_refined, refine_matches
+from tensor_stereo.scores.repair import repair_matches
 from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Matches
 
@@ -110,15 +109,13 @@ class FilterOutput:
         Raises:
             ValueError, TypeError: as :func:`tensor_stereo.scores.refine_matches`.
         """
-        flat = self._flat()
-        views = _list_views(images0, images1, self.matches.num_pairs)
+        flat, graphs = self._flat(), self._graphs()
+        alignment = self._known_alignment(graphs)
         moved = refine_matches(
-            self.matches, *views, flat.inlier, self._known_alignment(), self._graphs(), max_shift_px=max_shift_px
+            self.matches, images0, images1, flat.inlier, alignment, graphs, max_shift_px=max_shift_px
         )
-        has_moved = (moved.keypoints1 != self.matches.keypoints1).any(1)
         origin = torch.zeros_like(flat.relation) if self.origin is None else self.origin
-        origin = torch.where(has_moved & (origin == Origin.GIVEN), int(Origin.REFINED), origin)
-        return replace(flat, matches=moved, origin=origin)
+        return replace(flat, matches=moved, origin=mark_refined(self.matches, moved, origin))
 
     def repair(
         self, images0: Images, images1: Images, *, keypoints0: Tensor | None = None, ptr0: Tensor | None = None
@@ -142,11 +139,10 @@ class FilterOutput:
         """
         if self.judge is None:
             raise ValueError("judge must be the filter that decided, got None")
-        views = _list_views(images0, images1, self.matches.num_pairs)
-        kept = self._flat().inlier
-        found = repair_matches(self.matches, *views, kept, self._known_alignment(), keypoints0=keypoints0, ptr0=ptr0)
-        shown = {"images0": views[0], "images1": views[1]} if self.judge.config.resolved_score == "learned" else {}
-        output = self.judge(found.matches, **shown)
+        kept, alignment = self._flat().inlier, self._known_alignment()
+        found = repair_matches(self.matches, images0, images1, kept, alignment, keypoints0=keypoints0, ptr0=ptr0)
+        is_shown = self.judge.config.resolved_score == "learned"
+        output = self.judge(found.matches, **({"images0": images0, "images1": images1} if is_shown else {}))
         return replace(output, rows=found.rows, origin=found.origin)  # type: ignore[no-any-return]
 
     def _flat(self) -> FilterOutput:
@@ -159,16 +155,16 @@ class FilterOutput:
             flat[name] = None if values is None else values[self.mask]
         return replace(self, **flat)
 
+    @property
+    def _settings(self) -> FilterConfig:
+        return FilterConfig() if self.judge is None else self.judge.config
+
     def _graphs(self) -> MatchGraphs:
-        settings = FilterConfig() if self.judge is None else self.judge.config
+        settings = self._settings
         return build_match_graphs(self.matches, tie_tolerance=settings.tie_tolerance, backend=settings.backend)
 
-    def _known_alignment(self) -> Alignment:
+    def _known_alignment(self, graphs: MatchGraphs | None = None) -> Alignment:
         if self.alignment is not None:
             return self.alignment
-        settings = FilterConfig() if self.judge is None else self.judge.config
-        return estimate_alignment(self.matches, self._graphs(), rectified=settings.rectified, backend=settings.backend)
-
-
-def _list_views(images0: Images, images1: Images, num_pairs: int) -> tuple[list[Tensor], list[Tensor]]:
-    return list_images("images0", images0, num_pairs), list_images("images1", images1, num_pairs)
+        settings, graphs = self._settings, self._graphs() if graphs is None else graphs
+        return estimate_alignment(self.matches, graphs, rectified=settings.rectified, backend=settings.backend)

@@ -6,21 +6,23 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
-from tensor_stereo.classification import classify_graphs, mask_untested
+from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
 from tensor_stereo.configs import PipelineConfig, Rectified
 from tensor_stereo.dense.semi_global import SemiGlobalMaps, match_keypoints, match_semi_global
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.improving import improve_matches, judge_matches
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
-from tensor_stereo.scores.alignment import Alignment
+from tensor_stereo.scores.alignment import Alignment, estimate_alignment
 from tensor_stereo.scores.by_name import ScoredMatches, score_matches
+from tensor_stereo.scores.refine import mark_refined, refine_matches
+from tensor_stereo.scores.repair import Origin, repair_matches
 from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Classification, Features, Matches
 
@@ -115,20 +117,12 @@ def run_pipeline(pairs: Sequence[ImagePair], config: PipelineConfig = PipelineCo
         matches = group_pairs(gray, matches, config, watch)
     with watch.measure("graph"):
         graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
-
-    def score(matches: Matches, graphs: MatchGraphs) -> ScoredMatches | None:
-        return score_pairs(gray, matches, graphs, config)
-
-    def group(matches: Matches) -> Matches:
-        return group_pairs(gray, matches, config, Stopwatch()) if config.constrained else matches
-
     with watch.measure("relate"):
         verdict = classify_graphs(graphs, config)
     with watch.measure("score"):
-        judged = judge_matches(matches, graphs, config, score, verdict)
+        judged = judge_matches(matches, graphs, verdict, score_pairs(gray, matches, graphs, config), config)
     with watch.measure("improve"):
-        views = [pair[0][0] for pair in gray], [pair[1][0] for pair in gray]
-        judged = improve_matches(judged, views, keypoints, config, score, group)
+        judged = improve_pairs(gray, judged, keypoints, config)
     found = judged.found
     if found is None:
         return PipelineOutput(judged.matches, judged.graphs, judged.verdict, None, watch.seconds, origin=judged.origin)
@@ -199,8 +193,7 @@ def detect_images(images: Sequence[Tensor], config: PipelineConfig) -> list[Feat
 
 def map_pairs(gray: Sequence[ImagePair], config: PipelineConfig) -> SemiGlobalMaps:
     """Semi-global disparity maps of both views of every pair."""
-    images0, images1 = ([pair[view][0] for pair in gray] for view in (0, 1))
-    return match_semi_global(images0, images1, config.sgbm)
+    return match_semi_global(*_by_view(gray), config.sgbm)
 
 
 def group_pairs(gray: Sequence[ImagePair], matches: Matches, config: PipelineConfig, watch: Stopwatch) -> Matches:
@@ -224,7 +217,83 @@ def score_pairs(
     """
     if config.resolved_score == "none":
         return None
-    images0, images1 = ([pair[view][0] for pair in gray] for view in (0, 1))
-    images = (images0, images1) if config.resolved_score == "learned" else None
+    images = _by_view(gray) if config.resolved_score == "learned" else None
     found = score_matches(matches, config, graphs, images=images)
     return found._replace(score=found.score.to(matches.keypoints0.dtype))
+
+
+class Judged(NamedTuple):
+    """Matches of B pairs, and what is decided about them.
+
+    Attributes:
+        matches: M matches.
+        graphs: Their graphs.
+        verdict: One per match.
+        score: (M,), 0 for untested matches; None without one.
+        found: Scores before the verdict, with their alignment; None without one.
+        origin: (M,) int8, values of :class:`tensor_stereo.scores.Origin`.
+    """
+
+    matches: Matches
+    graphs: MatchGraphs
+    verdict: Classification
+    score: Tensor | None
+    found: ScoredMatches | None
+    origin: Tensor
+
+
+def judge_matches(
+    matches: Matches,
+    graphs: MatchGraphs,
+    verdict: Classification,
+    found: ScoredMatches | None,
+    config: PipelineConfig,
+) -> Judged:
+    """The verdict that the settings want, from that of the graphs and from the scores, of matches as they came."""
+    score = None
+    if found is not None:
+        verdict, score = apply_score(verdict, found.score, matches.ptr, config)
+    origin = torch.full_like(verdict.relation, int(Origin.GIVEN))
+    return Judged(matches, graphs, verdict, score, found, origin)
+
+
+@torch.no_grad()
+def improve_pairs(gray: Sequence[ImagePair], judged: Judged, keypoints: Features, config: PipelineConfig) -> Judged:
+    """Repair rejected matches and judge all anew, and refine kept ones, as the settings say.
+
+    Args:
+        gray: As :func:`to_gray_pairs` gives them.
+        judged: The matches as they came.
+        keypoints: All keypoints of view 0, of which some have no match yet.
+        config: ``repair`` and ``refine``, and all that decides.
+
+    Returns:
+        The matches after it. No gradient.
+    """
+    views = _by_view(gray)
+    if config.repair:
+        kept, alignment = judged.verdict.inlier, _known_alignment(judged, config)
+        more = repair_matches(
+            judged.matches, *views, kept, alignment, keypoints0=keypoints.keypoints, ptr0=keypoints.ptr
+        )
+        matches = group_pairs(gray, more.matches, config, Stopwatch()) if config.constrained else more.matches
+        graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
+        found = score_pairs(gray, matches, graphs, config)
+        judged = judge_matches(matches, graphs, classify_graphs(graphs, config), found, config)
+        judged = judged._replace(origin=more.origin)
+    if config.refine:
+        kept, alignment = judged.verdict.inlier, _known_alignment(judged, config)
+        moved = refine_matches(judged.matches, *views, kept, alignment, judged.graphs)
+        judged = judged._replace(matches=moved, origin=mark_refined(judged.matches, moved, judged.origin))
+    return judged
+
+
+def _known_alignment(judged: Judged, config: PipelineConfig) -> Alignment:
+    if judged.found is not None and judged.found.alignment is not None:
+        return judged.found.alignment
+    return estimate_alignment(judged.matches, judged.graphs, rectified=config.rectified, backend=config.backend)
+
+
+def _by_view(gray: Sequence[ImagePair]) -> tuple[list[Tensor], list[Tensor]]:
+    """The images (1, H, W) of view 0, and those of view 1."""
+    return [image0[0] for image0, _ in gray], [image1[0] for _, image1 in gray]

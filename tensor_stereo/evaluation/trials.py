@@ -17,12 +17,19 @@ from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
 from tensor_stereo.evaluation.truth import errors_against_gt
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
-from tensor_stereo.improving import Judged, improve_matches, judge_matches
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.pipeline import STAGES as PIPELINE_STAGES
-from tensor_stereo.pipeline import Stopwatch, detect_pairs, group_pairs, map_pairs, score_pairs, to_gray_pairs
-from tensor_stereo.scores.by_name import ScoredMatches
+from tensor_stereo.pipeline import (
+    Judged,
+    Stopwatch,
+    detect_pairs,
+    improve_pairs,
+    judge_matches,
+    map_pairs,
+    score_pairs,
+    to_gray_pairs,
+)
 from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.types import Classification, Features, Matches, Relation, StereoPair
 
@@ -261,7 +268,7 @@ class TrialRunner:
             found = share("score", lambda: score_pairs(self._gray, matches, graphs, trial))
         if found is not None:  # it may be that of another tolerance
             found = found._replace(score=found.within(trial.max_error_px).to(found.score.dtype))
-        judged = judge_matches(matches, graphs, trial, lambda *_: found, verdict)
+        judged = judge_matches(matches, graphs, verdict, found, trial)
         if trial.repair or trial.refine:
             given = judged
             judged, error_px = share("improve", lambda: self._improve(given, features[0], trial))
@@ -275,15 +282,7 @@ class TrialRunner:
 
     def _improve(self, judged: Judged, keypoints: Features, trial: TrialConfig) -> tuple[Judged, Tensor]:
         """What repair and refinement leave, and how far it is from ground truth."""
-        views = [self._gray[0][0][0]], [self._gray[0][1][0]]
-
-        def group(matches: Matches) -> Matches:
-            return group_pairs(self._gray, matches, trial, Stopwatch()) if trial.constrained else matches
-
-        def score(matches: Matches, graphs: MatchGraphs) -> ScoredMatches | None:
-            return score_pairs(self._gray, matches, graphs, trial)
-
-        improved = improve_matches(judged, views, keypoints, trial, score, group)
+        improved = improve_pairs(self._gray, judged, keypoints, trial)
         return improved, self._errors(improved.matches)
 
     def _perturb(self, matches: Matches, trial: TrialConfig) -> tuple[Matches, Tensor]:

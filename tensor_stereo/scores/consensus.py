@@ -134,9 +134,14 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignm
             refuse_tangent(name, values, "consensus")
     check_match_graphs(matches, graphs)
     settings = config.consensus
+    right, row_offset, found1 = _see_view1(matches, alignment)
     belief: Tensor = ops.consensus_belief(
         matches.keypoints0,
-        *_displacements(matches, alignment),
+        right,
+        matches.ptr,
+        matches.cost,
+        row_offset,
+        found1,
         *graphs.patterns,
         settings.tolerance_px,
         settings.whole_tolerance_px,
@@ -152,17 +157,15 @@ def _believe(matches: Matches, graphs: MatchGraphs, config: FilterConfig, alignm
     return belief
 
 
-def _displacements(
-    matches: Matches, alignment: Alignment | None
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor | None]:
-    """Keypoints of view 1, offsets of the pairs, cost, offset of the rows, and keypoints of view 1 as found."""
+def _see_view1(matches: Matches, alignment: Alignment | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Keypoints of view 1 as displacements want them, offsets from the rows, and keypoints of view 1 as found."""
     right = matches.keypoints1
     row_offset = matches.keypoints0[:, 1].double() - right[:, 1].double()
     if alignment is None:
-        return right, matches.ptr, matches.cost, row_offset, None
+        return right, row_offset, None
     row_offset = row_offset + alignment.row_shift(matches)
     if not torch.compiler.is_compiling() and bool(alignment.rectified.all()):
-        return right, matches.ptr, matches.cost, row_offset, None
+        return right, row_offset, None
     batch = ptr_to_batch(matches.ptr)
     frames = epipolar_frames(matches, alignment)
     is_rectified, has_rows = (values.index_select(0, batch) for values in (alignment.rectified, alignment.has_rows))
@@ -171,4 +174,4 @@ def _displacements(
     is_rectified = is_rectified[:, None]
     # Keypoints that were found on whole pixels may have been moved since in view 1; of any two views, view 0 tells.
     found = torch.where(is_rectified, right, matches.keypoints0)
-    return torch.where(is_rectified, right.double(), frames.partners), matches.ptr, matches.cost, row_offset, found
+    return torch.where(is_rectified, right.double(), frames.partners), row_offset, found

@@ -21,7 +21,8 @@ from torch.nn import functional
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, no_alignment
-from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs
+from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs, search_line
+from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.scores.windows import (
     LIKE,
     MIDDLE,
@@ -124,7 +125,7 @@ def measure_images(
     if alignment is None:
         alignment = no_alignment(matches.num_pairs, matches.keypoints0)
     aligned = align_matches(matches, alignment)
-    places = find_places(matches, aligned, graphs, alignment)
+    places = find_places(matches, aligned, estimate_slopes(aligned, graphs), alignment)
     has_rows = alignment.has_rows.tolist()
     ranges = [
         (first, count if known else min(count, _DISC_PLACES))
@@ -252,14 +253,11 @@ def _measure_one(
     slanted = other.slanted(partners, RADIUS_PX + _NEAR_PX, shear)
     along, along_likeness, _ = compare(slanted, kernels[..., list(_SLANTED)], has_tight=False)
     offset = lowest_place(along) * (1 + shear[:, :1])  # whose places are that far apart
-    lowest_step = -(first + max(count - 1, 0)) if reverse else first
     rows = [0] if has_rows else list(range(-_DISC_PX, _DISC_PX + 1))
     searched = []
     for row in rows:
-        begin = other.place(points, lowest_step, across + row)
-        strips = other.strips(other.place(begin, torch.full_like(first, -RADIUS_PX), 0 * across), count + 2 * RADIUS_PX)
+        strips, outside = search_line(other, points, across + row, first, count, reverse=reverse)
         far, far_likeness, _ = compare(strips, kernels[..., whole])
-        outside = other.outside(begin, count)
         searched.append((far, far_likeness, outside.flip(1) if reverse else outside))
     far, far_likeness, outside = (torch.cat(part, 1) for part in zip(*searched, strict=True))
     place = torch.arange(count, device=own.device).repeat(len(rows))

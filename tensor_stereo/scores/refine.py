@@ -16,6 +16,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs, check_match_graphs
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, epipolar_frames, map_points, no_alignment
+from tensor_stereo.scores.repair import Origin
 from tensor_stereo.scores.samplers import Place, Sampler, blur, find_places, look_at_pairs
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.scores.windows import NOISE_VARIANCE, RADIUS_PX, TIGHT, window_kernels
@@ -112,7 +113,7 @@ def _find_shifts(
 ) -> tuple[Tensor, Tensor]:
     """(M,) px of view 0 along and across the lines, 0 where a match stays."""
     aligned = align_matches(matches, alignment)
-    places = find_places(matches, aligned, graphs, alignment)
+    places = find_places(matches, aligned, estimate_slopes(aligned, graphs), alignment)
     found = [torch.zeros(matches.num_matches, device=matches.ptr.device) for _ in range(3)]
     offsets = matches.ptr.tolist()
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
@@ -185,3 +186,15 @@ def _trust_neighbors(aligned: Matches, graphs: MatchGraphs, kept: Tensor, along:
     total, pull = (torch.zeros_like(measured).index_add(0, i, values) for values in (weight, weight * miss))
     change = pull / (1 / (_DISTRUST * variance) + total)
     return torch.where(along != 0, along - change, along)
+
+
+def mark_refined(before: Matches, after: Matches, origin: Tensor) -> Tensor:
+    """(M,) int8 values of :class:`tensor_stereo.scores.Origin`, with those given matches marked that have moved.
+
+    >>> points = torch.tensor([[3.0, 4.0]])
+    >>> ptr, given = torch.tensor([0, 1]), torch.zeros(1, dtype=torch.int8)
+    >>> mark_refined(Matches(points, points, ptr), Matches(points, points + 0.1, ptr), given)
+    tensor([1], dtype=torch.int8)
+    """
+    has_moved = (after.keypoints1 != before.keypoints1).any(1)
+    return torch.where(has_moved & (origin == int(Origin.GIVEN)), int(Origin.REFINED), origin).to(torch.int8)

@@ -13,14 +13,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tensor_stereo.batching import ptr_to_batch, select_matches
+from tensor_stereo.batching import batch_to_ptr, ptr_to_batch, select_matches
+from tensor_stereo.delaunay.one_to_one import coincident_ids, first_of_coincident
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.ops.segments import to_points
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, map_points, no_alignment
 from tensor_stereo.scores.image_evidence import MAX_DISPARITIES
-from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs
+from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs, search_line
 from tensor_stereo.scores.slopes import estimate_slopes
-from tensor_stereo.scores.windows import LIKE, NUM_WHOLE, RADIUS_PX, TIGHT, compare_windows, window_kernels
+from tensor_stereo.scores.windows import (
+    LIKE,
+    NUM_WHOLE,
+    RADIUS_PX,
+    TIGHT,
+    compare_windows,
+    parabola_offset,
+    window_kernels,
+)
 from tensor_stereo.types import Matches, check_mask, check_points, check_ptr, check_vector
 
 _LEAST_KEPT = 4  # matches of a pair that predict for others
@@ -103,8 +113,7 @@ def repair_matches(
     check_mask("kept", kept)
     if alignment is None:
         alignment = no_alignment(matches.num_pairs, matches.keypoints0)
-    free, free_batch = _free_keypoints(matches, keypoints0, ptr0)
-    targets = _collect_targets(matches, kept, free, free_batch)
+    targets = _collect_targets(matches, kept, *_list_keypoints(matches, keypoints0, ptr0))
     partners, found = _search(views, matches, kept, targets, alignment)
     return _join(matches, targets, partners, found)
 
@@ -117,42 +126,40 @@ class _Targets(NamedTuple):
     ptr: Tensor  # (B + 1,)
 
 
-def _free_keypoints(matches: Matches, keypoints0: Tensor | None, ptr0: Tensor | None) -> tuple[Tensor, Tensor]:
-    """(N', 2) distinct keypoints that no match of their pair has, and (N',) their pairs."""
+def _list_keypoints(matches: Matches, keypoints0: Tensor | None, ptr0: Tensor | None) -> tuple[Tensor, Tensor]:
+    """(N, 2) float64 keypoints and (N,) their pairs; raises unless they fit."""
     if keypoints0 is None:
         return matches.keypoints0[:0].double(), matches.ptr[:0]
-    check_points("keypoints0", keypoints0)
-    if ptr0 is None and matches.num_pairs != 1:
-        raise ValueError(f"ptr0 must be given with keypoints0 of {matches.num_pairs} pairs")
-    ptr0 = matches.ptr.new_tensor([0, len(keypoints0)]) if ptr0 is None else ptr0
+    if ptr0 is None:
+        if matches.num_pairs != 1:
+            raise ValueError(f"ptr0 must be given with keypoints0 of {matches.num_pairs} pairs")
+        check_points("keypoints0", keypoints0)
+        ptr0 = matches.ptr.new_tensor([0, len(keypoints0)])
     check_ptr("ptr0", ptr0, len(keypoints0))
     if ptr0.shape != matches.ptr.shape:
         raise ValueError(f"ptr0 must be offsets of {matches.num_pairs} pairs, got those of {len(ptr0) - 1}")
-    batch = torch.cat([ptr_to_batch(matches.ptr), ptr_to_batch(ptr0)])
-    points = torch.cat([matches.keypoints0.double(), keypoints0.double()])
-    _, first_of = torch.unique(torch.cat([batch[:, None].double(), points], 1), dim=0, return_inverse=True)
-    order = torch.arange(len(points), device=points.device)
-    least = torch.full_like(order, len(points)).scatter_reduce(0, first_of, order, "amin")
-    rows = (least.index_select(0, first_of) == order).nonzero()[:, 0]
-    rows = rows[rows >= matches.num_matches]
-    return points.index_select(0, rows), batch.index_select(0, rows)
+    to_points("keypoints0", keypoints0, ptr0)  # none is NaN
+    return keypoints0.double(), ptr_to_batch(ptr0)
 
 
-def _collect_targets(matches: Matches, kept: Tensor, free: Tensor, free_batch: Tensor) -> _Targets:
-    """Rejected matches whose keypoint no kept match has, and free keypoints."""
-    batch = ptr_to_batch(matches.ptr)
-    keys = torch.cat([batch[:, None].double(), matches.keypoints0.double()], 1)
-    _, same = torch.unique(keys, dim=0, return_inverse=True)
-    taken = torch.zeros_like(same).scatter_reduce(0, same, kept.to(same.dtype), "amax").index_select(0, same) > 0
-    order = torch.arange(len(same), device=same.device)
-    least = torch.full_like(order, len(same)).scatter_reduce(0, same, order, "amin").index_select(0, same)
-    rows = (~taken & (least == order)).nonzero()[:, 0]
-    points = torch.cat([matches.keypoints0.double().index_select(0, rows), free])
-    pairs = torch.cat([batch.index_select(0, rows), free_batch])
-    rows = torch.cat([rows, torch.full_like(free_batch, -1)])
+def _collect_targets(matches: Matches, kept: Tensor, keypoints: Tensor, batch: Tensor) -> _Targets:
+    """Rejected matches whose keypoint no kept match has, and keypoints that no match has, each place once."""
+    points = torch.cat([matches.keypoints0.detach().double(), keypoints])
+    pairs = torch.cat([ptr_to_batch(matches.ptr), batch])
+    ids = coincident_ids(*(values.numpy(force=True) for values in (points, pairs)))
+    is_first = torch.from_numpy(first_of_coincident(ids)).to(pairs.device)
+    places = torch.from_numpy(ids).to(pairs.device)
+    taken = torch.zeros_like(is_first).index_fill(0, places[: matches.num_matches][kept], True)
+    rows = (is_first & ~taken[places]).nonzero()[:, 0]
+    order, ptr = _by_pair(pairs[rows], matches.num_pairs)
+    rows = rows[order]
+    return _Targets(points[rows], torch.where(rows < matches.num_matches, rows, -1), ptr)
+
+
+def _by_pair(pairs: Tensor, num_pairs: int) -> tuple[Tensor, Tensor]:
+    """The stable order that sorts rows by their pairs, and the offsets of the pairs in it."""
     order = pairs.argsort(stable=True)
-    ptr = torch.searchsorted(pairs.index_select(0, order), torch.arange(matches.num_pairs + 1, device=pairs.device))
-    return _Targets(points.index_select(0, order), rows.index_select(0, order), ptr)
+    return order, batch_to_ptr(pairs[order], num_pairs)
 
 
 def _search(
@@ -161,20 +168,15 @@ def _search(
     """(T, 2) partners of the targets, and (T,) whether one was found."""
     known = select_matches(matches, kept)
     back = torch.linalg.inv_ex(alignment.to_view0)[0]
-    # in one batch with the known ones, so that lines of both point the same way; each target is its own partner
-    ends = torch.stack([known.ptr, targets.ptr], 1)
     there = map_points(back, targets.points, ptr_to_batch(targets.ptr))
-    order = (2 * torch.cat([ptr_to_batch(known.ptr), ptr_to_batch(targets.ptr)])).add(
-        torch.cat([torch.zeros(known.num_matches), torch.ones(len(there))]).long().to(known.ptr.device)
-    )
-    order = order.argsort(stable=True)
-    left = torch.cat([known.keypoints0.double(), targets.points]).index_select(0, order)
-    right = torch.cat([known.keypoints1.double(), there]).index_select(0, order)
-    both = Matches(left, right, ends.sum(1))
-    graphs = build_match_graphs(both)
+    # in one batch behind the known ones, so that lines of both point the same way; each target is its own partner
+    order, ptr = _by_pair(torch.cat([ptr_to_batch(known.ptr), ptr_to_batch(targets.ptr)]), matches.num_pairs)
+    left = torch.cat([known.keypoints0.double(), targets.points])[order]
+    both = Matches(left, torch.cat([known.keypoints1.double(), there])[order], ptr)
     aligned = align_matches(both, alignment)
-    places = find_places(both, aligned, graphs, alignment)
-    of_known = align_matches(known, alignment)
+    places = find_places(both, aligned, torch.zeros_like(left, dtype=torch.float32), alignment)
+    is_known = order < known.num_matches
+    of_known = Matches(aligned.keypoints0[is_known], aligned.keypoints1[is_known], known.ptr)
     slope = estimate_slopes(of_known, build_match_graphs(known)).double()
     disparity = of_known.keypoints0[:, 0] - of_known.keypoints1[:, 0]
     partners, found = there.clone(), torch.zeros(len(there), dtype=torch.bool, device=there.device)
@@ -185,20 +187,15 @@ def _search(
             count = offsets[b + 1] - offsets[b]
             if count < _LEAST_KEPT or whole.start == whole.stop:
                 continue
-            begin = int(both.ptr[b])
-            seats = aligned.keypoints0[begin : int(both.ptr[b + 1])]
+            seats = aligned.keypoints0[both.ptr[b] : both.ptr[b + 1]]
             predicted = _predict(seats[count:], seats[:count], disparity[mine], slope[mine])
             first, width = _range(predicted, disparity[mine])
-            at = torch.arange(count, len(seats), device=seats.device)
-            for part in torch.arange(len(at), device=at.device).split(_ROWS_AT_ONCE):  # type: ignore[no-untyped-call]
-                rows = at[part]
-                seen = [look.select(rows) for look in looks]
-                best, is_known = _best_disparity(seen, own.select(rows), predicted[part].float(), first, width)
-                place = own.select(rows)
+            for rows in torch.arange(len(predicted), device=seats.device).split(_ROWS_AT_ONCE):  # type: ignore[no-untyped-call]
+                seen, place = [look.select(count + rows) for look in looks], own.select(count + rows)
+                best, is_inside = _best_disparity(seen, place, predicted[rows].float(), first, width)
                 moved = seen[1].place(place.left, -best, place.across).double()
-                pair = torch.full_like(rows, b)
-                partners[whole.start + part] = map_points(back, moved, pair)
-                found[whole.start + part] = is_known
+                partners[whole.start + rows] = map_points(back, moved, torch.full_like(rows, b))
+                found[whole.start + rows] = is_inside
     return partners, found
 
 
@@ -231,21 +228,15 @@ def _best_disparity(
     """(m,) px to a fraction, and whether a place near a prediction lies inside of view 1."""
     windows = looks[0].windows(places.left, RADIUS_PX)
     kernels = window_kernels(windows)[..., :NUM_WHOLE]
-    begin = looks[1].place(places.left, torch.full_like(places.across, -(first + count - 1)), places.across)
-    strips = looks[1].strips(
-        looks[1].place(begin, torch.full_like(places.across, -RADIUS_PX), torch.zeros_like(places.across)),
-        count + 2 * RADIUS_PX,
-    )
+    lowest = torch.full_like(places.across, first)
+    strips, outside = search_line(looks[1], places.left, places.across, lowest, count, reverse=True)
     cost, _, _ = compare_windows(windows, strips, kernels, has_tight=True)
     cost = cost.flip(1)[..., [LIKE, TIGHT]].mean(2)
     disparity = first + torch.arange(count, device=cost.device, dtype=cost.dtype)
     near = ((disparity[:, None] - predicted[:, None]).abs() <= _NEAR_PX).any(2)
-    allowed = near & ~looks[1].outside(begin, count).flip(1)
+    allowed = near & ~outside.flip(1)
     k = cost.masked_fill(~allowed, _NOWHERE).argmin(1, keepdim=True).clamp(1, count - 2)
-    before, least, after = (cost.gather(1, k + step)[:, 0].exp() for step in (-1, 0, 1))
-    bend = (before - 2 * least + after).clamp(min=1e-3)
-    fraction = ((before - after) / (2 * bend)).clamp(-0.5, 0.5)
-    return disparity[k[:, 0]] + fraction, allowed.any(1)
+    return disparity[k[:, 0]] + parabola_offset(cost.exp(), k).clamp(-0.5, 0.5), allowed.any(1)
 
 
 def _join(matches: Matches, targets: _Targets, partners: Tensor, found: Tensor) -> RepairedMatches:
@@ -260,13 +251,12 @@ def _join(matches: Matches, targets: _Targets, partners: Tensor, found: Tensor) 
     origin = torch.full((count,), Origin.GIVEN, dtype=torch.int8, device=right.device)
     origin[targets.rows[replaced]] = int(Origin.REPAIRED)
     pairs = torch.cat([batch, ptr_to_batch(targets.ptr)[new]])
-    order = pairs.argsort(stable=True)
+    order, ptr = _by_pair(pairs, matches.num_pairs)
 
     def join(given: Tensor, more: Tensor) -> Tensor:
         return torch.cat([given, more.to(given.dtype)]).index_select(0, order)
 
     rows = torch.arange(count, device=right.device)
-    ptr = torch.searchsorted(pairs.index_select(0, order), torch.arange(matches.num_pairs + 1, device=right.device))
     dtype = matches.keypoints0.dtype
     joined = Matches(
         join(matches.keypoints0, targets.points[new]),

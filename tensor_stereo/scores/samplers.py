@@ -13,9 +13,7 @@ from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import to_gray
-from tensor_stereo.graphs import MatchGraphs
-from tensor_stereo.scores.alignment.form import Alignment, epipolar_frames, map_points
-from tensor_stereo.scores.slopes import estimate_slopes
+from tensor_stereo.scores.alignment.form import Alignment, epipolar_frames, map_points, turn_vectors
 from tensor_stereo.scores.windows import RADIUS_PX, sample_frames, sample_slanted, sample_strips, sample_windows
 from tensor_stereo.types import Matches
 
@@ -51,13 +49,11 @@ class Place(NamedTuple):
     @property
     def off_line(self) -> Tensor:
         """(m,) px, how far the partner lies from its line, across it."""
-        x, y = (self.right - self.left).unbind(1)
-        return self.along[:, 0] * y - self.along[:, 1] * x - self.across
+        return turn_vectors(self.right - self.left, self.along)[:, 1] - self.across
 
 
-def find_places(matches: Matches, aligned: Matches, graphs: MatchGraphs, alignment: Alignment) -> Place:
-    """The places of all matches; ``right`` is that of view 1 taken to view 0."""
-    slope = estimate_slopes(aligned, graphs)
+def find_places(matches: Matches, aligned: Matches, slope: Tensor, alignment: Alignment) -> Place:
+    """The places of all matches, whose disparities have the (M, 2) slopes where they are aligned."""
     disparity = (aligned.keypoints0[:, 0] - aligned.keypoints1[:, 0]).float()
     right, across = matches.keypoints1, alignment.row_shift(matches)
     along = torch.tensor([1.0, 0.0], device=slope.device).expand_as(slope)
@@ -65,14 +61,10 @@ def find_places(matches: Matches, aligned: Matches, graphs: MatchGraphs, alignme
         batch = ptr_to_batch(matches.ptr)
         frames = epipolar_frames(matches, alignment)
         is_rectified, has_rows = (values.index_select(0, batch) for values in (alignment.rectified, alignment.has_rows))
-        moved = frames.partners - matches.keypoints0.double()
-        x, y = frames.along.unbind(1)
-        own_row = x * moved[:, 1] - y * moved[:, 0]
+        own_row = turn_vectors(frames.partners - matches.keypoints0.double(), frames.along)[:, 1]
         line_row = torch.where(has_rows, own_row - frames.moved[:, 1], own_row)
         across = torch.where(is_rectified, across, line_row)
-        c, s = frames.turn.index_select(0, batch).unbind(1)
-        cosine, sine = (c * x + s * y).float(), (c * y - s * x).float()
-        turned = torch.stack([cosine * slope[:, 0] + sine * slope[:, 1], cosine * slope[:, 1] - sine * slope[:, 0]], 1)
+        turned = turn_vectors(slope, turn_vectors(frames.along, frames.turn.index_select(0, batch)).float())
         is_rectified = is_rectified[:, None]
         right = torch.where(is_rectified, right.double(), frames.partners)
         along = torch.where(is_rectified, along, frames.along.float())
@@ -162,6 +154,32 @@ class LineSampler(NamedTuple):
 
 
 Sampler = RowSampler | LineSampler
+
+
+def search_line(
+    look: Sampler, points: Tensor, across: Tensor, first: Tensor, count: int, *, reverse: bool
+) -> tuple[Tensor, Tensor]:
+    """Strips of the other view whose windows lie at some disparities of each point.
+
+    Args:
+        look: At the other view.
+        points: (m, 2) px.
+        across: (m,) px, how far across a point its line lies in the other view.
+        first: (m,) px, the least disparity; ``count`` - 1 px more is the greatest.
+        count: Number of disparities D.
+        reverse: Whether disparity grows against the columns: from view 0 to view 1.
+
+    Returns:
+        (m, 15, D + 14) grey levels, and (m, D) bool, which places lie outside; both along the columns, so that reversed
+        ones begin with the greatest disparity.
+
+    >>> look = RowSampler(torch.arange(9.0).expand(5, 9))
+    >>> search_line(look, torch.tensor([[4.0, 2.0]]), torch.zeros(1), torch.tensor([3.0]), 3, reverse=True)[1]
+    tensor([[ True, False, False]])
+    """
+    begin = look.place(points, -(first + max(count - 1, 0)) if reverse else first, across)
+    before = look.place(begin, torch.full_like(first, -RADIUS_PX), torch.zeros_like(across))
+    return look.strips(before, count + 2 * RADIUS_PX), look.outside(begin, count)
 
 
 def look_at_pairs(

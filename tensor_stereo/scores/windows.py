@@ -165,9 +165,18 @@ def lowest_place(log_ssd: Tensor) -> Tensor:
     ssd = log_ssd.exp()
     num_places = ssd.shape[1]
     k = ssd.argmin(1, keepdim=True).clamp(1, num_places - 2)
+    return k[:, 0] - num_places // 2 + parabola_offset(ssd, k).clamp(-1, 1)
+
+
+def parabola_offset(ssd: Tensor, k: Tensor) -> Tensor:
+    """(m, ...) how far from the places k (m, 1, ...) of (m, D, ...) the parabola through three places is lowest.
+
+    >>> parabola_offset(torch.tensor([[4.0, 1.0, 1.0, 4.0]]), torch.tensor([[1]]))
+    tensor([0.5000])
+    """
     before, least, after = (ssd.gather(1, k + step)[:, 0] for step in (-1, 0, 1))
     bend = (before - 2 * least + after).clamp(min=1e-3)
-    return k[:, 0] - num_places // 2 + ((before - after) / (2 * bend)).clamp(-1, 1)
+    return (before - after) / (2 * bend)
 
 
 def _likeness(windows: Tensor, center: Tensor, levels: float, far: Tensor) -> Tensor:

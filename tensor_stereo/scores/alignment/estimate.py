@@ -10,7 +10,7 @@ from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.configs import Backend, Rectified
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.scores.alignment.form import LEAST_VOTES, Alignment
-from tensor_stereo.scores.alignment.pair_sums import select_rows
+from tensor_stereo.scores.alignment.pair_sums import PairSums, select_rows
 from tensor_stereo.scores.alignment.rows import FIT_PX, fit_alignment
 from tensor_stereo.scores.alignment.views import fit_views
 from tensor_stereo.types import Matches
@@ -96,13 +96,8 @@ def _are_steady(matches: Matches, rows: Alignment, agreeing: Tensor) -> Tensor:
 def _crowd_on_rows(matches: Matches) -> Tensor:
     """(B,) bool, whether more matches of all lie near their rows than chance would leave there."""
     offset = _row_offset(matches).abs()
-    batch = ptr_to_batch(matches.ptr)
-    near, wide = (
-        torch.zeros(matches.num_pairs, dtype=torch.float64, device=offset.device).index_add(
-            0, batch, (offset <= limit).double()
-        )
-        for limit in (_MAX_SHIFT_PX, _WIDE_PX)
-    )
+    pairs = PairSums(ptr_to_batch(matches.ptr), matches.ptr)
+    near, wide = (pairs.sum((offset <= limit).double()) for limit in (_MAX_SHIFT_PX, _WIDE_PX))
     by_chance = (wide - near) * (_MAX_SHIFT_PX / (_WIDE_PX - _MAX_SHIFT_PX))
     return near >= _LEAST_CROWD + _CROWDED * by_chance
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import ptr_to_batch
+from tensor_stereo.scores.alignment.pair_sums import PairSums
 from tensor_stereo.types import Matches
 
 LEAST_AGREEING = 12  # matches that a fit needs
@@ -107,13 +108,13 @@ def epipolar_frames(matches: Matches, alignment: Alignment) -> EpipolarFrames:
     has_line = length > _NOWHERE
     safe = torch.where(has_line, length, 1)
     along = torch.where(has_line[:, None], torch.stack([normal_y, -normal_x], 1) / safe[:, None], _right(x)[None])
-    turn = torch.stack([_sum(values, batch, matches.num_pairs) for values in along.unbind(1)], 1)
+    turn = PairSums(batch, matches.ptr).sum(along)
     flip = torch.where((turn[:, 0] < 0) | ((turn[:, 0] == 0) & (turn[:, 1] < 0)), -1.0, 1.0)
     length = turn.square().sum(1, keepdim=True).sqrt()
     spread = 1 - length[:, 0] / matches.ptr.diff().clamp(min=1)
     turn = torch.where(length > _NOWHERE, turn * flip[:, None] / length.clamp(min=_NOWHERE), _right(x)[None])
     flip = flip.index_select(0, batch)
-    moved = _turn(partners - left, along * flip[:, None])
+    moved = turn_vectors(partners - left, along * flip[:, None])
     u, v = partners.detach().unbind(1)
     off = torch.where(has_line, (normal_x * u + normal_y * v + constant) / safe * flip, moved[:, 1])
     moved = moved + torch.stack([torch.zeros_like(off), (off - moved[:, 1]).detach()], 1)
@@ -139,7 +140,7 @@ def align_matches(matches: Matches, alignment: Alignment) -> Matches:
         batch = ptr_to_batch(matches.ptr)
         frames = epipolar_frames(matches, alignment)
         is_rectified = alignment.rectified.index_select(0, batch)[:, None]
-        turned = _turn(left, frames.turn.index_select(0, batch))
+        turned = turn_vectors(left, frames.turn.index_select(0, batch))
         left, right = torch.where(is_rectified, left, turned), torch.where(is_rectified, right, turned + frames.moved)
     return Matches(left, right, matches.ptr, matches.cost, matches.group)
 
@@ -180,8 +181,12 @@ def map_points(homography: Tensor, points: Tensor, batch: Tensor) -> Tensor:
     return torch.stack([(m[0] * x + m[1] * y + m[2]) / depth, (m[3] * x + m[4] * y + m[5]) / depth], 1)
 
 
-def _turn(vectors: Tensor, along: Tensor) -> Tensor:
-    """(M, 2) coordinates of vectors along, and across to the left of, unit vectors, y pointing down."""
+def turn_vectors(vectors: Tensor, along: Tensor) -> Tensor:
+    """(M, 2) coordinates of vectors along unit vectors and across them, a quarter turn from x to y.
+
+    >>> turn_vectors(torch.tensor([[3.0, 4.0]]), torch.tensor([[0.0, 1.0]]))
+    tensor([[ 4., -3.]])
+    """
     x, y = vectors.unbind(1)
     c, s = along.unbind(1)
     return torch.stack([c * x + s * y, c * y - s * x], 1)
@@ -189,7 +194,3 @@ def _turn(vectors: Tensor, along: Tensor) -> Tensor:
 
 def _right(like: Tensor) -> Tensor:
     return like.new_tensor([1.0, 0.0])
-
-
-def _sum(values: Tensor, batch: Tensor, num_pairs: int) -> Tensor:
-    return values.new_zeros(num_pairs).index_add(0, batch, values)

@@ -7,8 +7,9 @@ scene in the list.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -63,17 +64,32 @@ class Putatives:
     matches: Matches
     images: tuple[Tensor, Tensor]  # (1, H, W) uint8
     error_px: Tensor  # (M,)
+    repaired: Tensor | None = None  # (M,) bool, None: none is
+
+
+class Found(NamedTuple):
+    """Matches under one setting, with the views that they were found in."""
+
+    kind: str
+    fixed: bool
+    views: Views
+    matches: Matches
 
 
 def find_putatives(scene: Scene, number: int) -> list[Putatives]:
     """All putatives of one scene, which is the ``number``-th."""
-    views, found = read_views(scene), []
+    return [judge_matches(scene, *found) for found in find_matches(scene, number)]
+
+
+def find_matches(scene: Scene, number: int, num_altered: int | None = None) -> Iterator[Found]:
+    """The matches of one scene, and of ``num_altered`` variants of it; None: of all."""
+    views = read_views(scene)
     for detector in ("sift", "fast", "gftt") if scene.fold is not None else ():
         for matching in (MatchingConfig(), GATES):
             config = replace(FIXED, detector=detector, matching=matching)
             kind = f"{detector}{' g' if matching is GATES else ''}"
-            found.append(judge_matches(scene, kind, True, views, match(*views[:2], config)))
-    for variant in range(VARIANTS[scene.domain]):
+            yield Found(kind, True, views, match(*views[:2], config))
+    for variant in range(VARIANTS[scene.domain] if num_altered is None else num_altered):
         rng = np.random.default_rng([5, number, variant])
         altered = alter(views, rng)
         if not np.isfinite(altered.disparity0).any():
@@ -91,8 +107,7 @@ def find_putatives(scene: Scene, number: int) -> list[Putatives]:
         if matches.num_matches < MIN_MATCHES:
             continue
         kind = f"{config.detector}-{backend}{' g' if gated else ''}{' moved' if is_moved else ''}"
-        found.append(judge_matches(scene, kind, False, altered, matches))
-    return found
+        yield Found(kind, False, altered, matches)
 
 
 def judge_matches(scene: Scene, kind: str, fixed: bool, views: Views, matches: Matches) -> Putatives:

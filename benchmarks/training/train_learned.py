@@ -1,15 +1,18 @@
 """Train a network of the learned score, cross-validate it over scenes and drives, calibrate it, write its weights.
 
     python benchmarks/training/train_learned.py rectified DATA TRAINING_DATA WORK weights_rectified.safetensors
+    python benchmarks/training/repaired_matches.py DATA TRAINING_DATA WORK
+    python benchmarks/training/train_learned.py rectified DATA TRAINING_DATA WORK weights_rectified.safetensors
     python benchmarks/training/learned_matches.py DATA TRAINING_DATA WORK
     python benchmarks/training/train_learned.py views DATA TRAINING_DATA WORK weights_views.safetensors
 
 DATA and TRAINING_DATA hold the scenes of ``scenes.py``; the eight of the paper (2003, 2005) are never read.
 WORK/rectified and WORK/views receive the putatives of every scene and what the network sees of them (3 GB each), and
-the weights and the figures of the cross-validation. The network of any two views also learns from rectified pairs, seen
-as if nobody had said so, and from the matches that ``learned_matches.py`` leaves in WORK/aliked; the real pairs of any
-two views are left for ``accuracy/any_views.py``. Everything follows from the seeds below; each training runs on one
-thread.
+the weights and the figures of the cross-validation. Both networks also learn from the matches that
+``repaired_matches.py`` leaves in WORK/repaired, once they are there: the networks of a first training say what is to be
+repaired for the second. The network of any two views also learns from rectified pairs, seen as if nobody had said so,
+and from the matches that ``learned_matches.py`` leaves in WORK/aliked; the real pairs of any two views are left for
+``accuracy/any_views.py``. Everything follows from the seeds below; each training runs on one thread.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ from shared.calibration_error import calibration_error
 from training.learned_matches import KIND as ALIKED
 from training.platt_scaling import fit_calibration
 from training.putatives import Putatives, find_putatives
+from training.repaired_matches import KIND as REPAIRED
 from training.scenes import NUM_FOLDS, Scene, list_scenes
 from training.two_views import find_two_views
 from training.work_folder import fold_weights, items_path, putatives_path
@@ -70,6 +74,7 @@ class Item(NamedTuple):
     quantities: Quantities
     known: Tensor  # (M, 5) bool, whether the truth can judge each tolerance
     correct: Tensor  # (M, 5) bool
+    repaired: Tensor | None = None  # (M,) bool, None: none is
 
 
 def record_scene(kind: str, work: Path, scene: Scene, number: int) -> None:
@@ -84,11 +89,14 @@ def record_scene(kind: str, work: Path, scene: Scene, number: int) -> None:
 def measure_scene(kind: str, work: Path, scene: Scene) -> None:
     """Write what the network sees of the putatives of a scene."""
     torch.set_num_threads(1)
-    found = _load_putatives(work / kind, scene)
-    if kind == VIEWS:
+    found, repaired = _load_putatives(work / kind, scene), _load_putatives(work / REPAIRED, scene)
+    if kind == RECTIFIED:
+        found += repaired
+    else:
         others = _load_putatives(work / RECTIFIED, scene)
         altered = [one for one in others if not one.fixed]
         others = [one for one in others if one.fixed] + altered[:NUM_ALTERED] + _load_putatives(work / ALIKED, scene)
+        others += [one for one in repaired if one.fixed]
         found += [replace(one, domain=RECTIFIED) for one in others]
     items = [to_item(one, rectified=kind == RECTIFIED) for one in found]
     torch.save(items, items_path(work / kind, scene.name))
@@ -107,7 +115,7 @@ def to_item(given: Putatives, *, rectified: bool = True) -> Item:
     quantities = measure_quantities(matches, graphs, evidence, alignment=alignment)
     error = given.error_px[:, None]
     known = error.isfinite() & (given.least_error_px <= _TOLERANCES)
-    return Item(given.domain, given.kind, given.fixed, quantities, known, error <= _TOLERANCES)
+    return Item(given.domain, given.kind, given.fixed, quantities, known, error <= _TOLERANCES, given.repaired)
 
 
 def collate(items: Sequence[Item], shown: Sequence[tuple[bool, bool]]) -> tuple[Quantities, Tensor, Tensor]:
@@ -200,6 +208,7 @@ class LeftOut(NamedTuple):
     bare: Tensor  # (M, 5) without images
     known: Tensor
     correct: Tensor
+    repaired: Tensor | None
 
 
 @torch.no_grad()
@@ -215,7 +224,7 @@ def cross_validate(work: Path, scenes: Sequence[Scene], fold: int | None) -> tup
         for shows_images in (True, False):
             q, known, correct = collate([item], [(True, shows_images)])
             logits.append(network.infer(q)[0])
-        found.append(LeftOut(item.domain, item.kind, item.fixed, *logits, known, correct))
+        found.append(LeftOut(item.domain, item.kind, item.fixed, *logits, known, correct, item.repaired))
     print(f"fold {fold}: {time.perf_counter() - start:.0f} s", flush=True)
     return network.state_dict(), found
 
@@ -235,7 +244,10 @@ def calibrate(found: Sequence[LeftOut]) -> Tensor:
 
 
 def report(found: Sequence[LeftOut], calibration: Tensor) -> dict[str, dict[str, list[float]]]:
-    """By domain, tolerance and kind: AUC, specificity, the same without images, and the calibration error."""
+    """By domain, tolerance and kind: AUC, specificity, the same without images, and the calibration error.
+
+    Repaired matches also stand by themselves, with the calibration error alone.
+    """
     network = LearnedScore()
     network.calibration.copy_(calibration)
     figures, pooled = defaultdict(list), defaultdict(list)
@@ -247,15 +259,19 @@ def report(found: Sequence[LeftOut], calibration: Tensor) -> dict[str, dict[str,
             if not one.fixed or not len(correct):
                 continue
             pooled[key].append((probability[rows, k], correct))
+            if one.repaired is not None:
+                alone = rows & one.repaired
+                pooled[f"{key}, alone"].append((probability[alone, k], one.correct[alone, k]))
             if 0 < correct.sum() < len(correct):
                 counts = [roc_update(logit[rows, k], correct) for logit in (one.logit, one.bare)]
                 figures[key].append([f for c in counts for f in (c.auc(), c.specificity_at(PAPER_SENSITIVITY))])
+    errors = {
+        key: calibration_error(*(torch.cat(x) for x in zip(*parts, strict=True))) for key, parts in pooled.items()
+    }
     return {
-        key: {
-            "auc, specificity": np.mean(values, 0).round(4).tolist(),
-            "calibration error": round(calibration_error(*(torch.cat(x) for x in zip(*pooled[key], strict=True))), 4),
-        }
-        for key, values in figures.items()
+        key: {"calibration error": round(error, 4)}
+        | ({"auc, specificity": np.mean(figures[key], 0).round(4).tolist()} if key in figures else {})
+        for key, error in errors.items()
     }
 
 

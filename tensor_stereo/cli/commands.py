@@ -82,6 +82,13 @@ class Filter:
     """File of keypoints that belongs to an .h5 of hloc or DISK."""
     score_name: str | None = None
     """Name of the score in .npz, .csv and .parquet: score, or filter_score beside a score of yours, if not given."""
+    images: Path | None = None
+    """Folder of the images, at which the score looks then: hloc, DISK and COLMAP name them; .csv and .parquet need the
+    columns image0 and image1, .npz arrays of these names."""
+    repair: bool = False
+    """Search rejected matches, and keypoints without a partner, again where kept ones say; needs --images."""
+    refine: bool = False
+    """Move kept matches to where the images fit best, to a fraction of a pixel; needs --images."""
     config: Annotated[FileFilterConfig, Flat] = field(default_factory=FileFilterConfig)
 
 

@@ -22,6 +22,8 @@ from tensor_stereo.configs import EvaluationConfig
 if TYPE_CHECKING:
     from tensor_stereo.interop.verdicts import FilterSummary
 
+_FILTER_SETTINGS = ("keypoints", "score_name", "config", "images", "repair", "refine")
+
 # The library is imported where it is called: no command waits for what it does not use.
 
 
@@ -97,7 +99,7 @@ def _run_filter(command: Filter) -> int:
     from tensor_stereo.interop.match_files import filter_file
     from tensor_stereo.interop.match_lists import is_many
 
-    settings = {name: getattr(command, name) for name in ("keypoints", "score_name", "config")}
+    settings = {name: getattr(command, name) for name in _FILTER_SETTINGS}
     if is_many(command.matches, command.out):
         return _filter_many(command, settings)
     return _print_counts(filter_file(command.matches, command.out, **settings), command)
@@ -129,6 +131,9 @@ def _print_counts(summary: FilterSummary, command: Filter) -> int:
     num_agreeing = values.pop("num_agreeing")
     if not command.config.is_probability:
         del values["num_rectified"]
+    if not (command.repair or command.refine):
+        for name in ("num_improved", "num_refined", "num_repaired"):
+            del values[name]
     for name, value in values.items():
         print(f"{name:20}{value:8}")
     return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)

@@ -1,7 +1,7 @@
 """Databases of COLMAP: matches as pairs of rows of the keypoints of two images.
 
-COLMAP counts pixel corners, not centres, as integers: its keypoints are half a pixel larger than those of this library.
-No verdict depends on a shift, and no keypoint is written, so they are taken as they are.
+COLMAP counts pixel corners, not centres, as integers: its keypoints are half a pixel larger than those of this library,
+which is taken off when they are read and given back to those that are written.
 
 The tables are read with SQLite, not by ``pycolmap.Database``: opening one brings its file to the installed version's
 schema, and reading believes the number of rows before it looks at the data.
@@ -16,17 +16,13 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from tensor_stereo.interop.verdicts import (
-    Array,
-    FilterSummary,
-    MatchFilter,
-    Verdicts,
-    filter_each,
-    pair_matches,
-)
+from tensor_stereo.interop.added_keypoints import AddedKeypoints, extend_rows, place_kept
+from tensor_stereo.interop.image_filter import PairImages, filter_stream
+from tensor_stereo.interop.verdicts import Array, FilterSummary, Improved, Int, MatchFilter, Verdicts, pair_matches
 from tensor_stereo.limits import MAX_ROWS
 from tensor_stereo.types import Matches
 
@@ -34,7 +30,12 @@ TABLE = "tensor_stereo_verdicts"
 _CREATE = f"""CREATE TABLE {TABLE} (
     pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
     inlier BLOB, score BLOB, relation BLOB)"""
+IMPROVED_TABLE = "tensor_stereo_improved"
+_CREATE_IMPROVED = f"""CREATE TABLE {IMPROVED_TABLE} (
+    pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
+    origin BLOB, score BLOB)"""
 _KEYS = {"matches": "pair_id", "keypoints": "image_id"}
+_CORNER_PX = 0.5
 _FULL = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
 
 
@@ -46,6 +47,12 @@ def filter_colmap(source: Path, target: Path, run: MatchFilter) -> FilterSummary
     the blobs ``inlier`` uint8, ``score`` float32 (NULL if the settings name none) and ``relation`` int8. The rows of
     ``two_view_geometries`` whose pair loses matches are removed, since they were estimated from those too: run COLMAP's
     geometric verification again.
+
+    A filter that looks at the images finds their names in the table ``images``. If it repairs or refines, ``matches``
+    holds what is kept then. Partners that have moved are new rows of ``keypoints`` and ``descriptors``, behind those of
+    their image and for this pair alone, so that tracks over more than two images end there. The table
+    ``tensor_stereo_improved`` has the same matches with the blobs ``origin`` uint8, values of
+    :class:`tensor_stereo.scores.Origin`, and ``score`` float32.
 
     Raises:
         ValueError: if the database is damaged, unfinished or no such; the message names file, table and pair.
@@ -76,15 +83,19 @@ def _filter_copy(source: Path, database: sqlite3.Connection, run: MatchFilter) -
     _check_schema(source, database)
     database.execute("PRAGMA journal_mode = MEMORY")  # one file; COLMAP's own mode leaves two more beside it
     database.execute("BEGIN")
-    database.execute(f"DROP TABLE IF EXISTS {TABLE}")  # of an earlier filter
+    for name in (TABLE, IMPROVED_TABLE):
+        database.execute(f"DROP TABLE IF EXISTS {name}")  # of an earlier filter
     database.execute(_CREATE)
     has_geometries = "two_view_geometries" in _tables(database)
-    summary = FilterSummary()
-    for pair_id, verdicts in filter_each(_read_pairs(source, database), run):
-        _write_verdicts(database, pair_id, verdicts)
-        if has_geometries and not verdicts.inlier.all():
-            database.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id,))
-        summary = summary.add(1, verdicts)
+    summary, added = FilterSummary(), AddedKeypoints[int]()
+    for pair, verdicts, improved in filter_stream(_read_pairs(source, database), run):
+        _write_verdicts(database, pair.pair_id, verdicts)
+        if improved is not None:
+            _write_improved(database, pair, improved, added)
+        if has_geometries and (improved is not None or not verdicts.inlier.all()):
+            database.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair.pair_id,))
+        summary = summary.add(1, verdicts, improved)
+    _append_keypoints(source, database, added)
     database.execute("COMMIT")
     return summary
 
@@ -108,11 +119,22 @@ def _check_schema(source: Path, database: sqlite3.Connection) -> None:
         raise ValueError(f"{source} must have no triggers, which COLMAP does not write, got {triggers}")
 
 
-def _read_pairs(source: Path, database: sqlite3.Connection) -> Iterator[tuple[int, Matches]]:
+class _Pair(NamedTuple):
+    pair_id: int
+    images: tuple[int, int]
+    rows0: Int
+    rows1: Int
+    keypoints0: Array  # (N0, 2) px, as the library counts them
+    num_known1: int  # keypoints of the second image
+
+
+def _read_pairs(source: Path, database: sqlite3.Connection) -> Iterator[tuple[_Pair, Matches, PairImages]]:
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError(f"pycolmap must be installed to read {source.name}") from error
+    has_names = "images" in _tables(database)
+    names = dict(database.execute("SELECT image_id, name FROM images")) if has_names else {}
     for (pair_id,) in database.execute("SELECT pair_id FROM matches ORDER BY pair_id").fetchall():
         place = f"{source}, pair_id {pair_id!r}"
         if not isinstance(pair_id, int) or pair_id < 0:
@@ -131,8 +153,14 @@ def _read_pairs(source: Path, database: sqlite3.Connection) -> Iterator[tuple[in
                 known = f"there are {len(points)} keypoints"
                 raise ValueError(f"{place}: row {row} of the matches names keypoint {given} of view {view}, {known}")
         rows0, rows1 = rows.astype(np.int64).reshape(-1, 2).T
-        left, right = (points[:, :2] if len(points) else points.reshape(0, 2) for points in (points0, points1))
-        yield pair_id, pair_matches(place, left, right, rows0, rows1)
+        left, right = (
+            (points[:, :2] if len(points) else points.reshape(0, 2)).astype(np.float64) - _CORNER_PX
+            for points in (points0, points1)
+        )
+        pair = _Pair(pair_id, (image1, image2), rows0, rows1, left, len(right))
+        name1, name2 = (str(names.get(image, f"image {image}")) for image in (image1, image2))
+        images = PairImages(name1, name2, left)
+        yield pair, pair_matches(place, left, right, rows0, rows1), images
 
 
 def _read_blob(place: str, database: sqlite3.Connection, table: str, key: int, dtype: str) -> Array:
@@ -162,3 +190,59 @@ def _write_verdicts(database: sqlite3.Connection, pair_id: int, verdicts: Verdic
     rows = _read_blob(f"pair_id {pair_id}", database, "matches", pair_id, "<u4")[verdicts.inlier]
     changed = "UPDATE matches SET rows = ?, data = ? WHERE pair_id = ?"
     database.execute(changed, (len(rows), rows.tobytes(), pair_id))
+
+
+def _write_improved(database: sqlite3.Connection, pair: _Pair, improved: Improved, added: AddedKeypoints[int]) -> None:
+    """Put the matches after repair and refinement in the place of those that the filter left."""
+    rows0, rows1, kept = place_kept(
+        improved, (pair.rows0, pair.rows1), pair.keypoints0, pair.num_known1, pair.images, added
+    )
+    data = np.stack([rows0, rows1], axis=1).astype("<u4").tobytes()
+    database.execute("UPDATE matches SET rows = ?, data = ? WHERE pair_id = ?", (len(kept), data, pair.pair_id))
+    if IMPROVED_TABLE not in _tables(database):
+        database.execute(_CREATE_IMPROVED)
+    score = None if improved.score is None else improved.score[kept].astype("<f4").tobytes()
+    values = (pair.pair_id, len(kept), data, improved.origin[kept].astype(np.uint8).tobytes(), score)
+    database.execute(f"INSERT INTO {IMPROVED_TABLE} VALUES (?, ?, 2, ?, ?, ?)", values)
+
+
+def _append_keypoints(source: Path, database: sqlite3.Connection, added: AddedKeypoints[int]) -> None:
+    """Write the rows of the keypoints that improved matches need, and as many descriptors."""
+    has_descriptors = "descriptors" in _tables(database)
+    for image, parts in added:
+        place = f"{source}, image {image}"
+        known = _read_blob(place, database, "keypoints", image, "<f4")
+        more = []
+        for part in parts:
+            rows = np.zeros((len(part.points), known.shape[1]), np.float32)
+            rows[:, :2] = part.points + _CORNER_PX
+            like = _read_blob(place, database, "keypoints", part.partner, "<f4")
+            if like.shape[1] == known.shape[1]:
+                rows[:, 2:] = like[part.rows, 2:]  # scale and orientation
+            more.append(rows)
+        whole = extend_rows(known, np.concatenate(more))
+        changed = "UPDATE keypoints SET rows = ?, data = ? WHERE image_id = ?"
+        database.execute(changed, (len(whole), whole.astype("<f4").tobytes(), image))
+        if has_descriptors:
+            described = _descriptors(database, image)
+            if len(described) == len(known):
+                more = [_take(_descriptors(database, part.partner), part.rows, described.shape[1]) for part in parts]
+                data = np.concatenate([described, *more])
+                changed = "UPDATE descriptors SET rows = ?, data = ? WHERE image_id = ?"
+                database.execute(changed, (len(data), data.tobytes(), image))
+
+
+def _take(descriptors: Array, rows: Int, width: int) -> Array:
+    """Some rows; zeros where another extractor has been at work."""
+    if descriptors.shape[1] != width or len(descriptors) <= rows.max(initial=-1):
+        return np.zeros((len(rows), width), np.uint8)
+    return descriptors[rows]
+
+
+def _descriptors(database: sqlite3.Connection, image: int) -> Array:
+    """(rows, bytes of each) of an image, of whatever type they are."""
+    found = database.execute("SELECT rows, data FROM descriptors WHERE image_id = ?", (image,)).fetchone()
+    rows, data = found or (0, b"")
+    if not rows or not isinstance(data, bytes) or len(data) % rows:
+        return np.zeros((0, 0), np.uint8)
+    return np.frombuffer(data, np.uint8).reshape(rows, -1)

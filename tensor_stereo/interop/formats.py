@@ -17,6 +17,18 @@ FORMATS = {
 }
 
 
+KEYPOINTS_ENDING = ".keypoints.h5"
+
+
+def keypoints_beside(out: Path) -> Path:
+    """The file of keypoints beside a result whose matches have keypoints of their own.
+
+    >>> keypoints_beside(Path("filtered.h5")).name
+    'filtered.keypoints.h5'
+    """
+    return out.with_name(out.stem + KEYPOINTS_ENDING)
+
+
 def check_files(source: Path, out: Path, keypoints: Path | None, score_name: str | None = None) -> str:
     """Look at the files of :func:`tensor_stereo.filter_file` before any work, and make the folder of ``out``.
 

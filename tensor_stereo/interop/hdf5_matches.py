@@ -22,10 +22,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from tensor_stereo.interop.added_keypoints import AddedKeypoints, KeptRows, place_kept
 from tensor_stereo.interop.hdf5 import OF_PAIR, Copy, find_exported, has, is_exported, member, open_file, read, reading
+from tensor_stereo.interop.hdf5_keypoints import append_keypoints
+from tensor_stereo.interop.image_filter import ImageFilter, PairImages, filter_stream
 from tensor_stereo.interop.index_arrays import Indices, index_matches
-from tensor_stereo.interop.result_names import ResultNames, name_results
-from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, Verdicts, filter_each
+from tensor_stereo.interop.result_names import ResultNames, free_name, name_results
+from tensor_stereo.interop.verdicts import Array, FilterSummary, Improved, MatchFilter, Verdicts
 from tensor_stereo.types import Matches
 
 _NOTE = "putative_results"  # attribute with the names of the results
@@ -46,10 +49,22 @@ class _Found(NamedTuple):
     pair: _Pair
     stored: Array
     indices: Indices
+    keypoints0: Array  # (N0, 2) px, all of them
+    num_known1: int  # keypoints of the second image
     in_rows: bool = True  # whether DISK's array is (S, 2)
 
 
-def filter_hdf5(source: Path, target: Path, run: MatchFilter, keypoints: Path | None) -> FilterSummary:
+class _Better(NamedTuple):
+    """The matches of a pair that are kept after repair and refinement."""
+
+    rows: KeptRows
+    score: Array | None
+    origin: Array
+
+
+def filter_hdf5(
+    source: Path, target: Path, run: MatchFilter, keypoints: Path | None, keypoints_out: Path | None = None
+) -> FilterSummary:
     """Copy a file of matches without what the filter rejects.
 
     Of hloc the groups ``name0/name1`` are read and, as older versions wrote them, ``name0_name1``, in which ``/`` of
@@ -65,12 +80,19 @@ def filter_hdf5(source: Path, target: Path, run: MatchFilter, keypoints: Path | 
 
     Everything else is carried through. Links to other places or files are refused.
 
+    A filter that looks at the images finds them by the names of hloc and DISK. If it repairs or refines, the matches
+    are those that are kept then, each group or dataset has their ``improved_score`` float32 and ``origin`` int8, values
+    of :class:`tensor_stereo.scores.Origin`, of one length with the matches, and partners that have moved are keypoints
+    of their own, behind those of their image and for this pair alone, in ``keypoints_out``: a copy of ``keypoints`` in
+    which other datasets of the image, such as descriptors, are as much longer.
+
     Args:
         source: file of matches.
         target: the copy.
         run: the filter.
         keypoints: file of features: for every image a group by its name with the dataset ``keypoints`` (N, 2), as hloc
             writes it, or a dataset (N, 2) by its name, as DISK does; None for files of glue-factory.
+        keypoints_out: the copy of ``keypoints`` that a filter needs which repairs or refines.
 
     Raises:
         ValueError: if a file is damaged or a dataset is wrong; the message names file, pair and row.
@@ -82,6 +104,8 @@ def filter_hdf5(source: Path, target: Path, run: MatchFilter, keypoints: Path | 
         matches_file = files.enter_context(open_file(source))
         features = None
         if keypoints is None:
+            if isinstance(run, ImageFilter):
+                raise ValueError(f"images must be None for {source}: pairs of glue-factory do not name their images")
             pairs = [_Pair("glue-factory", path) for path in find_exported(source, matches_file)]
         else:
             features = files.enter_context(open_file(keypoints))
@@ -89,16 +113,20 @@ def filter_hdf5(source: Path, target: Path, run: MatchFilter, keypoints: Path | 
         shutil.copyfile(source, target)
         copy = files.enter_context(Copy(target, "r+b"))
         with open_file(source, copy) as result:
+            added = AddedKeypoints[str]()
             items = _read_pairs(source, matches_file, keypoints or source, features, pairs)
-            for found, verdicts in filter_each(items, run):
+            for found, verdicts, improved in filter_stream(items, run):
+                better = None if improved is None else _place(found, improved, added)
                 with reading(source):
                     if found.pair.form == "disk":
-                        _replace_dataset(result, found, verdicts)
+                        _replace_dataset(result, found, verdicts, better)
                     else:
-                        _write_group(result[found.pair.path], found, verdicts)
+                        _write_group(result[found.pair.path], found, verdicts, better)
                 copy.check(source)
-                summary = summary.add(1, verdicts)
+                summary = summary.add(1, verdicts, improved)
         copy.check(source)
+        if keypoints_out is not None and keypoints is not None:
+            append_keypoints(keypoints, keypoints_out, added)
     return summary
 
 
@@ -168,16 +196,18 @@ def _only(source: Path, keypoints: Path, name: str, images: dict[str, list[str]]
 
 def _read_pairs(
     source: Path, matches_file: Any, keypoints: Path, features: Any, pairs: list[_Pair]
-) -> Iterator[tuple[_Found, Matches]]:
+) -> Iterator[tuple[_Found, Matches, PairImages]]:
     in_rows = _is_in_rows(source, matches_file, [pair for pair in pairs if pair.form == "disk"])
     for pair in pairs:
         place = f"{source}, pair '{pair.path}'"
         if pair.form == "glue-factory":
-            yield _read_exported(place, matches_file, pair)
+            yield *_read_exported(place, matches_file, pair), PairImages("", "")
             continue
         points0, points1 = (_read_keypoints(keypoints, features, image) for image in (pair.image0, pair.image1))
+        name0, name1 = (image.removesuffix("/keypoints") for image in (pair.image0, pair.image1))
+        images = PairImages(name0, name1, points0)
         if pair.form == "hloc":
-            yield _read_hloc(place, matches_file, pair, {"keypoints0": points0, "keypoints1": points1})
+            yield *_read_hloc(place, matches_file, pair, {"keypoints0": points0, "keypoints1": points1}), images
             continue
         folder, name = pair.path.rsplit("/", 1)
         with reading(place):
@@ -187,7 +217,7 @@ def _read_pairs(
             form = "(S, 2)" if in_rows else "(2, S)"
             raise ValueError(f"{place}: the matches must have shape {form} as in other pairs, got {stored.shape}")
         matches, indices = index_matches(place, {"keypoints0": points0, "keypoints1": points1, "matches": rows})
-        yield _Found(pair, stored, indices, in_rows), matches
+        yield _Found(pair, stored, indices, points0, len(points1), in_rows), matches, images
 
 
 def _is_in_rows(source: Path, matches_file: Any, pairs: list[_Pair]) -> bool:
@@ -207,7 +237,7 @@ def _read_hloc(place: str, matches_file: Any, pair: _Pair, arrays: dict[str, Arr
         if has(place, group, "matching_scores0"):
             arrays["matching_scores0"] = read(place, group, "matching_scores0", "f", 1)
     matches, indices = index_matches(place, arrays, may_be_short=True)
-    return _Found(pair, arrays["matches0"], indices), matches
+    return _Found(pair, arrays["matches0"], indices, arrays["keypoints0"], len(arrays["keypoints1"])), matches
 
 
 def _read_exported(place: str, matches_file: Any, pair: _Pair) -> tuple[_Found, Matches]:
@@ -218,7 +248,7 @@ def _read_exported(place: str, matches_file: Any, pair: _Pair) -> tuple[_Found, 
         for names, kinds in ((_INDEXED, "iu"), (_SCORES, "fiu")):
             arrays |= {name: read(place, group, name, kinds, 1) for name in names if has(place, group, name)}
     matches, indices = index_matches(place, arrays)
-    return _Found(pair, arrays["matches0"], indices), matches
+    return _Found(pair, arrays["matches0"], indices, arrays["keypoints0"], len(arrays["keypoints1"])), matches
 
 
 def _read_keypoints(keypoints: Path, features: Any, image: str) -> Array:
@@ -231,7 +261,14 @@ def _read_keypoints(keypoints: Path, features: Any, image: str) -> Array:
     return points
 
 
-def _write_group(group: Any, found: _Found, verdicts: Verdicts) -> None:
+def _place(found: _Found, improved: Improved, added: AddedKeypoints[str]) -> _Better:
+    given, images = (found.indices.rows0, found.indices.rows1), (found.pair.image0, found.pair.image1)
+    rows = place_kept(improved, given, found.keypoints0.astype(np.float64), found.num_known1, images, added)
+    score = None if improved.score is None else improved.score[rows.kept].astype(np.float32)
+    return _Better(rows, score, improved.origin[rows.kept])
+
+
+def _write_group(group: Any, found: _Found, verdicts: Verdicts, better: _Better | None) -> None:
     """Write -1 for what is rejected, and the verdicts beside it."""
     indices = found.indices
     taken = set(group)
@@ -239,9 +276,18 @@ def _write_group(group: Any, found: _Found, verdicts: Verdicts) -> None:
         del group[name]
         taken.remove(name)
     results = _results(found, verdicts, taken)
+    if better is not None:
+        results |= _improved_results(better, len(found.keypoints0), {*taken, *results})
+        partner = np.full(len(found.keypoints0), -1, np.int32)
+        partner[better.rows.rows0] = better.rows.rows1
+        attributes = dict(group["matches0"].attrs)
+        del group["matches0"]
+        group.create_dataset("matches0", data=partner).attrs.update(attributes)
     for name, values in {"putative_matches0": found.stored, **results}.items():
         group.create_dataset(name, data=values)
     group["putative_matches0"].attrs[_NOTE] = list(results)
+    if better is not None:
+        return
     group["matches0"][...] = np.where(~indices.mask | verdicts.spread(indices.mask).inlier, found.stored, -1)
     if found.pair.form == "glue-factory" and "matches1" in group:
         partner = group["matches1"][()]
@@ -249,6 +295,19 @@ def _write_group(group: Any, found: _Found, verdicts: Verdicts) -> None:
         rows0, rows1 = indices.rows0[rejected], indices.rows1[rejected]
         partner[rows1[partner[rows1] == rows0]] = -1
         group["matches1"][...] = partner
+
+
+def _improved_results(better: _Better, size: int | None, taken: set[str]) -> dict[str, Any]:
+    """Scores and origins of the kept matches, by row of view 0 if there is a ``size``, else in their order."""
+    results = {}
+    for name, values in {"improved_score": better.score, "origin": better.origin}.items():
+        if values is not None and size is not None:
+            wide = np.zeros(size, values.dtype)
+            wide[better.rows.rows0] = values
+            values = wide
+        if values is not None:
+            results[free_name(name, taken)] = values
+    return results
 
 
 def _results(found: _Found, verdicts: Verdicts, taken: set[str]) -> dict[str, Any]:
@@ -268,7 +327,7 @@ def _earlier(stored: Any, mark: str) -> list[str]:
     return [name for name in (mark, _NOTE, *notes.get(_NOTE, ResultNames())) if name in stored]
 
 
-def _replace_dataset(file: Any, found: _Found, verdicts: Verdicts) -> None:
+def _replace_dataset(file: Any, found: _Found, verdicts: Verdicts, better: _Better | None) -> None:
     """Write the inliers alone, with all matches as attributes, where no reader of DISK's files looks."""
     stored = found.stored
     keep = verdicts.spread(found.indices.mask).inlier
@@ -276,8 +335,13 @@ def _replace_dataset(file: Any, found: _Found, verdicts: Verdicts) -> None:
     earlier = _earlier(old, "putative_matches")
     attributes = {name: value for name, value in old.items() if name not in earlier}
     results = _results(found, verdicts, set(attributes))
+    left = stored[keep] if found.in_rows else stored[:, keep]
+    if better is not None:
+        results |= _improved_results(better, None, {*attributes, *results})
+        rows = np.stack([better.rows.rows0, better.rows.rows1], axis=1 if found.in_rows else 0)
+        left = rows.astype(np.promote_types(stored.dtype, np.int32))
     attributes |= {"putative_matches": stored, **results, _NOTE: list(results)}
     del file[found.pair.path]
-    dataset = file.create_dataset(found.pair.path, data=stored[keep] if found.in_rows else stored[:, keep])
+    dataset = file.create_dataset(found.pair.path, data=left)
     for name, values in attributes.items():
         dataset.attrs[name] = values

@@ -15,7 +15,7 @@ from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.match_lists import JOURNAL_FILE, SETTINGS_FILE, MatchFile, find_match_files
 from tensor_stereo.interop.verdicts import FilterSummary
 from tensor_stereo.locks import lock
-from tensor_stereo.paths import has_ending
+from tensor_stereo.paths import check_folder, has_ending
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 
@@ -44,6 +44,9 @@ def filter_files(
     keypoints: Path | str | None = None,
     score_name: str | None = None,
     config: FilterConfig | None = None,
+    images: Path | str | None = None,
+    repair: bool = False,
+    refine: bool = False,
     on_progress: Callable[[int, int, str], None] | None = None,
 ) -> FolderSummary:
     r"""Filter all files of matches in a folder or a list, each as :func:`~tensor_stereo.filter_file` does.
@@ -59,6 +62,9 @@ def filter_files(
         keypoints: File of keypoints for the ``.h5`` files of hloc or DISK, which hold none.
         score_name: Name of the score, as in :func:`~tensor_stereo.filter_file`. Not for ``.h5`` and ``.db``.
         config: Settings of verdict and score, as in :func:`~tensor_stereo.filter_file`.
+        images: Folder of the images of all files, as in :func:`~tensor_stereo.filter_file`.
+        repair: Search rejected matches again, as there.
+        refine: Move kept matches, as there.
         on_progress: Called after each file with the number of files done, their total and the name of the file.
 
     Returns:
@@ -80,7 +86,10 @@ def filter_files(
     """
     source, out = Path(source), Path(out)
     files = find_match_files(source, out, None if keypoints is None else Path(keypoints))
-    settings = {"config": asdict(config or FileFilterConfig()), "score_name": score_name}
+    looks = {"images": None if images is None else str(images), "repair": repair, "refine": refine}
+    if images is not None:
+        check_folder("images", Path(images))
+    settings = {"config": asdict(config or FileFilterConfig()), "score_name": score_name, **looks}
     errors: dict[str, str] = {}
     total = FilterSummary()
     num_found = 0
@@ -98,7 +107,7 @@ def filter_files(
                 total += FilterSummary(**entry["summary"])
             else:
                 try:
-                    summary = _filter_one(file, result, score_name, config)
+                    summary = _filter_one(file, result, score_name, config, looks)
                 except (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError) as error:
                     if isinstance(error, OSError) and error.errno in _NO_ROOM:
                         raise
@@ -114,13 +123,16 @@ def filter_files(
     return FolderSummary(len(files), num_found, errors, total)
 
 
-def _filter_one(file: MatchFile, result: Path, score_name: str | None, config: FilterConfig | None) -> FilterSummary:
+def _filter_one(
+    file: MatchFile, result: Path, score_name: str | None, config: FilterConfig | None, looks: dict[str, Any]
+) -> FilterSummary:
     return filter_file(
         file.source,
         result,
         keypoints=file.keypoints,
         score_name=None if has_ending(file.source, (".h5", ".db")) else score_name,
         config=config,
+        **looks,
     )
 
 

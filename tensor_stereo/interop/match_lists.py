@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tensor_stereo.interop.formats import FORMATS
+from tensor_stereo.interop.formats import FORMATS, KEYPOINTS_ENDING
 from tensor_stereo.paths import TABLES, check_folder, check_source, has_ending, prepare_folder
 
 LIST_COLUMNS = ("matches", "keypoints")
@@ -104,6 +104,7 @@ def _walk(source: Path, out: Path, keypoints: Path | None) -> Iterator[MatchFile
         for name in sorted(names):
             path = here / name
             is_match_file = has_ending(path, tuple(FORMATS)) and not name.startswith(".")
+            is_match_file &= not name.endswith(KEYPOINTS_ENDING)
             if is_match_file and path.resolve() not in passed_over:
                 yield MatchFile(path.relative_to(source).as_posix(), path, _keypoints_of(path, keypoints))
 

@@ -9,21 +9,20 @@ import polars as pl
 import torch
 
 from tensor_stereo.batching import lengths_to_ptr
-from tensor_stereo.interop.result_names import earlier_results, name_results
-from tensor_stereo.interop.verdicts import (
-    Array,
-    FilterSummary,
-    Int,
-    MatchFilter,
-    filter_matches,
-)
+from tensor_stereo.interop.image_filter import ImageFilter, PairImages, filter_pairs
+from tensor_stereo.interop.result_names import earlier_results, free_name, later_results, name_results
+from tensor_stereo.interop.verdicts import Array, FilterSummary, Improved, Int, MatchFilter
 from tensor_stereo.ops.segments import check_range
 from tensor_stereo.paths import has_ending
+from tensor_stereo.scores import Origin
 from tensor_stereo.table_files import read_csv, read_parquet, write_table
 from tensor_stereo.types import Matches, Relation
 
 _POINTS = ("x0", "y0", "x1", "y1")
 _RELATIONS = {relation.value: relation.name.lower() for relation in Relation}
+_ORIGINS = {origin.value: origin.name.lower() for origin in Origin}
+_IMAGES = ("image0", "image1")
+_IMPROVED = ("improved_x1", "improved_y1", "improved_inlier", "improved_score", "origin")
 _OF_CLASSIFY = ("inlier_adjacency", "inlier_cardinality")  # columns that nothing else writes
 
 
@@ -34,8 +33,11 @@ def filter_table(source: Path, target: Path, run: MatchFilter, *, score_name: st
     whose rows need not be adjacent; ``cost``, lower is better; ``group``, integer. All rows and columns are kept, in
     order. Results of an earlier filter are replaced; where a column of the user's has the name of a result, the result
     gets another one by :func:`~tensor_stereo.interop.result_names.name_results`.
-    What ``tensor-stereo classify --out`` writes is such a
-    table of one pair.
+    What ``tensor-stereo classify --out`` writes is such a table of one pair.
+
+    A filter that looks at the images needs their names in the columns ``image0`` and ``image1``, the same in all rows
+    of a pair. If it repairs or refines, ``improved_x1, improved_y1`` follow, where the partner is then,
+    ``improved_inlier`` and ``improved_score``, the verdict on that, and ``origin``: given, refined or repaired.
 
     Raises:
         ValueError: if the file is damaged or a column or value is wrong; the message names file, line of a
@@ -48,8 +50,10 @@ def filter_table(source: Path, target: Path, run: MatchFilter, *, score_name: st
             raise ValueError(f"{source} has no column {name!r}, it has {table.columns}")
     pair = _pair_numbers(source, table)
     order = np.argsort(pair, kind="stable")  # whole pairs, their rows in the order of the file
-    verdicts = filter_matches(_to_matches(source, table, pair, order), run)
-    verdicts = verdicts.take(np.argsort(order, kind="stable"))
+    images = _images(source, table, pair) if isinstance(run, ImageFilter) else []
+    verdicts, improved = filter_pairs(_to_matches(source, table, pair, order), images, run)
+    back = np.argsort(order, kind="stable")
+    verdicts, improved = verdicts.take(back), None if improved is None else improved.take(back)
     if set(_OF_CLASSIFY) <= set(table.columns):  # its verdicts are replaced by those of this filter
         table = table.drop("probability", "score", "inlier_score", *_OF_CLASSIFY, strict=False)
     table = table.drop(_earlier(table))
@@ -59,8 +63,37 @@ def filter_table(source: Path, target: Path, run: MatchFilter, *, score_name: st
         *([] if verdicts.score is None else [pl.Series(names.score, verdicts.score)]),
         pl.Series(names.relation, verdicts.relation).replace_strict(_RELATIONS, return_dtype=pl.String),
     )
+    if improved is not None:
+        table = table.with_columns(_improved_columns(improved, table.columns))
     write_table(table, target)
-    return FilterSummary().add(int(pair.max(initial=-1)) + 1, verdicts)
+    return FilterSummary().add(int(pair.max(initial=-1)) + 1, verdicts, improved)
+
+
+def _improved_columns(improved: Improved, taken: list[str]) -> list[pl.Series]:
+    """The matches after repair and refinement, in the rows of the given ones."""
+    names = [free_name(name, taken) for name in _IMPROVED]
+    origin = pl.Series(improved.origin).replace_strict(_ORIGINS, return_dtype=pl.String)
+    columns = (*improved.keypoints1.T, improved.inlier, improved.score, origin)
+    return [pl.Series(name, values) for name, values in zip(names, columns, strict=True) if values is not None]
+
+
+def _images(source: Path, table: pl.DataFrame, pair: Int) -> list[PairImages]:
+    """The images of each pair, in the order of the numbers of the pairs."""
+    for name in _IMAGES:
+        if name not in table.columns:
+            raise ValueError(
+                f"{source} has no column {name!r}, which names the images of each pair, it has {table.columns}"
+            )
+        if table[name].dtype != pl.String or table[name].has_nulls():
+            raise ValueError(f"{source}: column {name!r} must name an image in every row")
+    first = np.unique(pair, return_index=True)[1]
+    for name in _IMAGES:
+        differs = table[name].to_numpy() != table[name].to_numpy()[first][pair]
+        if differs.any():
+            row = int(differs.argmax())
+            raise ValueError(f"{_place(source, table, row)}: column {name!r} must be the same in all rows of a pair")
+    named = table.select(_IMAGES)[first]
+    return [PairImages(*names) for names in named.iter_rows()]
 
 
 def _earlier(table: pl.DataFrame) -> list[str]:
@@ -68,7 +101,7 @@ def _earlier(table: pl.DataFrame) -> list[str]:
     for names in earlier_results(table.columns):
         inlier, relation = (table[name].cast(pl.String, strict=False) for name in (names.inlier, names.relation))
         if inlier.is_in(["true", "false"]).all() and relation.is_in(list(_RELATIONS.values())).all():
-            return [name for name in names if name]
+            return [name for name in (*names, *later_results(table.columns, names.relation, _IMPROVED)) if name]
     return []
 
 

@@ -15,13 +15,17 @@ from tokenize import TokenError
 
 import numpy as np
 
-from tensor_stereo.interop.npz_forms import Header, find_form, form_matches
-from tensor_stereo.interop.result_names import earlier_results, name_results
-from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter, filter_matches
+from tensor_stereo.interop.image_filter import ImageFilter, PairImages, filter_pairs
+from tensor_stereo.interop.image_folder import ImageFolder
+from tensor_stereo.interop.index_arrays import one_pair
+from tensor_stereo.interop.npz_forms import IMPROVED, Header, ReadPairs, find_form, form_matches
+from tensor_stereo.interop.result_names import earlier_results, free_name, later_results, name_results
+from tensor_stereo.interop.verdicts import Array, FilterSummary, MatchFilter
 from tensor_stereo.limits import MAX_ROWS
 
 _HEADER_BYTES = 10_000  # what NumPy itself accepts of a header, by default
 _MAX_RATIO = 1032  # of deflate, by its format
+_IMAGES = ("image0", "image1")
 
 
 def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str | None = None) -> FilterSummary:
@@ -31,6 +35,13 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
     of the matches, or for each entry of the index array, where they are False, 0 and UNTESTED if there is no match. All
     other arrays are carried through as they are. Names of results that the archive uses for something else are chosen
     as in :func:`~tensor_stereo.interop.result_names.name_results`.
+
+    A filter that looks at the images finds their names in the arrays ``image0`` and ``image1``, a text each or one for
+    every pair, or in a file name as SuperGlue's ``match_pairs.py`` chooses it, ``left_right_matches.npz``. If it
+    repairs or refines, arrays with a row per match follow, first those given, whatever the form:
+    ``improved_keypoints0``, ``improved_keypoints1``, ``improved_inlier``, ``improved_score``, ``improved_relation``,
+    ``improved_origin``, values of :class:`tensor_stereo.scores.Origin`, and ``improved_rows``, the row of the match in
+    the archive, or its place in the index array counted along the rows, and -1 for keypoints that had no partner.
 
     Nothing is unpickled, and no array is allocated before the shape and dtype of its header fit the member's size.
 
@@ -49,9 +60,17 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
             ours = _earlier(members)
             names = name_results(str(source), members.keys() - ours, score_name)
             read_pairs = form_matches(str(source), form, arrays)
-            verdicts = filter_matches(read_pairs.matches, run)
+            images = []
+            if isinstance(run, ImageFilter):
+                named = {name: read(name) for name in _IMAGES if name in members}
+                images = _images(source, named, read_pairs, arrays[form.points0], run.images)
+            verdicts, improved = filter_pairs(read_pairs.matches, images, run)
             kind = members[form.points0][0].compress_type
-            results = dict(zip(names, read_pairs.lay_out(verdicts), strict=True))
+            results: dict[str, Array | None] = dict(zip(names, read_pairs.lay_out(verdicts), strict=True))
+            if improved is not None:
+                improved = improved._replace(rows=read_pairs.rows_of(improved.rows))
+                free = (free_name(name, members.keys() - ours) for name in IMPROVED)
+                results |= dict(zip(free, improved, strict=True))
             with zipfile.ZipFile(target, "w", kind) as result:
                 for name, (info, _) in members.items():
                     if name not in ours:
@@ -62,7 +81,34 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
                             np.lib.format.write_array(file, values, allow_pickle=False)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
         raise ValueError(f"{source} is no readable archive: {error}") from error
-    return FilterSummary().add(read_pairs.matches.num_pairs, verdicts)
+    return FilterSummary().add(read_pairs.matches.num_pairs, verdicts, improved)
+
+
+def _images(
+    source: Path, named: Mapping[str, Array], pairs: ReadPairs, keypoints0: Array, folder: ImageFolder
+) -> list[PairImages]:
+    """The images of each pair, by arrays or by the name of the file."""
+    count = pairs.matches.num_pairs
+    points = None if pairs.indices is None else one_pair(str(source), "keypoints0", keypoints0, 2)
+    if len(named) == len(_IMAGES):
+        names: list[list[str]] = []
+        for name, array in named.items():
+            texts = array.reshape(-1)
+            if array.dtype.kind != "U" or len(texts) != count:
+                given = f"{array.shape} {array.dtype}"
+                raise ValueError(f"{source}, array {name!r} must hold a text for each of {count} pairs, got {given}")
+            names.append(texts.tolist())
+        return [PairImages(name0, name1, points) for name0, name1 in zip(*names, strict=True)]
+    stem = source.stem.removesuffix("_matches")
+    cuts = [k for k, letter in enumerate(stem) if letter == "_"] if stem != source.stem else []
+    found = [(folder.find(stem[:k]), folder.find(stem[k + 1 :])) for k in cuts]
+    known = [PairImages(name0, name1, points) for name0, name1 in found if name0 is not None and name1 is not None]
+    if len(known) != 1 or count != 1:
+        raise ValueError(
+            f"{source} must name its images in the arrays 'image0' and 'image1', or be called 'left_right_matches.npz' "
+            f"after two of {folder.root}"
+        )
+    return known
 
 
 @contextmanager
@@ -78,7 +124,7 @@ def _earlier(members: Mapping[str, tuple[zipfile.ZipInfo, Header]]) -> set[str]:
     for names in earlier_results(list(members)):
         inlier, relation = (members[name][1] for name in (names.inlier, names.relation))
         if inlier.dtype == np.bool_ and relation == (inlier.shape, np.dtype(np.int8)):
-            return {name for name in names if name}
+            return {name for name in (*names, *later_results(list(members), names.relation, IMPROVED)) if name}
     return set()
 
 

@@ -31,7 +31,7 @@ import torch
 
 from tensor_stereo.interop.index_arrays import INDEX_ARRAYS, Indices, index_matches, one_pair
 from tensor_stereo.interop.result_names import earlier_results
-from tensor_stereo.interop.verdicts import Array, Int, Verdicts
+from tensor_stereo.interop.verdicts import Array, Improved, Int, Verdicts
 from tensor_stereo.ops.segments import check_range
 from tensor_stereo.types import Matches
 
@@ -44,6 +44,9 @@ _RAGGED = ("ptr", "cost", "group")  # of this library's own form
 # Names of arrays that say which rows are matches, whatever they hold; but not how good a match is.
 _SAYS_MATCH = re.compile(r"match|mkpt|kpts|idx|partner|mask|b_?ids", re.IGNORECASE)
 _SAYS_QUALITY = re.compile(r"score|conf|prob|dist|sim|cost", re.IGNORECASE)
+
+
+IMPROVED = tuple(f"improved_{name}" for name in Improved._fields)
 
 
 class Header(NamedTuple):
@@ -94,6 +97,11 @@ class ReadPairs:
             verdicts = verdicts.take(np.argsort(self.order, kind="stable"))
         return verdicts.reshape(self.shape)
 
+    def rows_of(self, rows: Int) -> Int:
+        """Where matches stand in the archive: their row, or their place in the index array; -1 stays."""
+        places = self.order if self.indices is None else np.flatnonzero(self.indices.mask)
+        return rows if places is None else np.where(rows < 0, -1, places[rows])
+
 
 def find_form(place: str, headers: Mapping[str, Header]) -> Form:
     """Tell the form of an archive by the names of its arrays.
@@ -121,7 +129,7 @@ def find_form(place: str, headers: Mapping[str, Header]) -> Form:
         raise ValueError(f"{place} holds the pair of each row twice, as 'ptr' and as {batch!r}; leave one of them out")
     arrays = (*views, *of_ours, *of_others)
     if "ptr" not in headers:  # it says that rows are matches
-        ours = {name for names in earlier_results(list(headers)) for name in names}
+        ours = {name for names in earlier_results(list(headers)) for name in (*names, *IMPROVED)}
         known = {*arrays, *ours, *(_POINTS if has_plain else ()), *(_COARSE if has_matched else ())}
         num_keypoints = {
             length for name in (*_POINTS, *views) if name in headers for length in headers[name].shape[:-1]

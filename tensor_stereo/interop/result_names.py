@@ -36,6 +36,29 @@ def earlier_results(names: Sequence[str]) -> Iterator[ResultNames]:
                 yield ResultNames(name, names[k + 1] if length == 2 else "", names[k + length])
 
 
+def later_results(names: Sequence[str], relation: str, improved: Sequence[str]) -> list[str]:
+    """The names of improved matches, or those chosen in their place, that stand right behind ``relation``.
+
+    >>> later_results(["x0", "relation", "improved_x1", "z"], "relation", ["improved_x1", "origin"])
+    ['improved_x1']
+    """
+    found = []
+    for name in names[names.index(relation) + 1 :]:
+        if not any(re.fullmatch(rf"(filter_)?{ours}(_\d+)?", name) for ours in improved):
+            break
+        found.append(name)
+    return found
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """The name, or another one like it that is not taken.
+
+    >>> free_name("score", ["score"])
+    'filter_score'
+    """
+    return next(other for other in _candidates(name) if other not in taken)
+
+
 def name_results(place: str, taken: Collection[str], score_name: str | None = None) -> ResultNames:
     """Choose names that leave every column or array of the user's alone.
 
@@ -55,7 +78,7 @@ def name_results(place: str, taken: Collection[str], score_name: str | None = No
     """
     if score_name in taken:
         raise ValueError(f"score_name must be a new name in {place}, which has {score_name!r}")
-    chosen = [next(other for other in _candidates(name) if other not in taken) for name in ResultNames()]
+    chosen = [free_name(name, taken) for name in ResultNames()]
     if score_name is not None:
         chosen[1] = score_name
     return ResultNames(*chosen)

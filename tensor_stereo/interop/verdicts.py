@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tensor_stereo.batching import collate_matches, select_pairs
 from tensor_stereo.modules import FilterOutput
 from tensor_stereo.ops.segments import check_range
+from tensor_stereo.scores import Origin
 from tensor_stereo.types import Matches, Relation
 
 Array = NDArray[Any]
@@ -37,14 +38,22 @@ class FilterSummary:
     num_untested: int = 0
     num_agreeing: int = 0  # whose neighbours in one view contain those in the other
     num_rectified: int = 0  # pairs that the score took for rectified; 0 where it does not ask
+    num_improved: int = 0  # kept after repair and refinement; 0 without
+    num_refined: int = 0  # of these, given ones that have moved
+    num_repaired: int = 0  # of these, such with another partner, or of keypoints that had none
 
-    def add(self, num_pairs: int, verdicts: Verdicts) -> FilterSummary:
+    def add(self, num_pairs: int, verdicts: Verdicts, improved: Improved | None = None) -> FilterSummary:
         """The counts with those of ``num_pairs`` more pairs."""
         num_matches, num_kept = len(verdicts.inlier), int(verdicts.inlier.sum())
         num_untested = int((verdicts.relation == Relation.UNTESTED).sum())
         num_agreeing = int(((verdicts.relation > 0) & (verdicts.relation < Relation.CONFLICT)).sum())
         num_rejected = num_matches - num_kept - num_untested
-        return self + FilterSummary(num_pairs, num_matches, num_kept, num_rejected, num_untested, num_agreeing)
+        summary = self + FilterSummary(num_pairs, num_matches, num_kept, num_rejected, num_untested, num_agreeing)
+        if improved is None:
+            return summary
+        origins = improved.origin[improved.inlier]
+        refined, repaired = (int((origins == int(origin)).sum()) for origin in (Origin.REFINED, Origin.REPAIRED))
+        return summary + FilterSummary(num_improved=len(origins), num_refined=refined, num_repaired=repaired)
 
     def __add__(self, other: FilterSummary) -> FilterSummary:
         return FilterSummary(*(mine + more for mine, more in zip(astuple(self), astuple(other), strict=True)))
@@ -95,6 +104,59 @@ class Verdicts(NamedTuple):
         return Verdicts(*(None if values is None else change(values) for values in self))  # type: ignore[arg-type]
 
 
+class Improved(NamedTuple):
+    """The matches of one or several pairs after repair and refinement, first those given, in their order.
+
+    Attributes:
+        keypoints0: (K, 2) px.
+        keypoints1: (K, 2) px.
+        rows: (K,) row of the given match, -1 for a keypoint that had no partner.
+        origin: (K,) values of :class:`tensor_stereo.scores.Origin`.
+        inlier: (K,) the verdict on the match as it is now.
+        score: (K,) None if the settings ask for none.
+        relation: (K,) values of Relation.
+    """
+
+    keypoints0: Float
+    keypoints1: Float
+    rows: Int
+    origin: Int8
+    inlier: Bool
+    score: Float | None
+    relation: Int8
+
+    def take(self, rows: Int) -> Improved:
+        """Some of them, in the order of ``rows``."""
+        return Improved(*(None if values is None else values[rows] for values in self))  # type: ignore[arg-type]
+
+
+Arrays = TypeVar("Arrays", Verdicts, Improved)
+
+
+def concatenate(kind: type[Arrays], parts: Sequence[Arrays]) -> Arrays:
+    """One after the other; what the first part lacks the whole lacks."""
+    columns = zip(*parts, strict=True)
+    return kind(*(None if values[0] is None else np.concatenate(values) for values in columns))  # type: ignore[arg-type]
+
+
+def to_verdicts(output: FilterOutput) -> Verdicts:
+    """The verdicts of a filter as arrays."""
+    score = None if output.score is None else output.score.detach().double().numpy()
+    return Verdicts(output.inlier.numpy(), score, output.relation.numpy())
+
+
+def to_improved(output: FilterOutput) -> Improved:
+    """What the filter said of repaired or refined matches, as arrays."""
+    count = output.matches.num_matches
+    left, right = (
+        points.detach().double().numpy() for points in (output.matches.keypoints0, output.matches.keypoints1)
+    )
+    rows = np.arange(count) if output.rows is None else output.rows.numpy()
+    origin = np.zeros(count, np.int8) if output.origin is None else output.origin.numpy()
+    inlier, score, relation = to_verdicts(output)
+    return Improved(left, right, rows, origin, inlier, score, relation)
+
+
 def _spread(values: Array, mask: Bool) -> Array:
     wide = np.zeros(mask.shape, values.dtype)
     wide[mask] = values
@@ -120,12 +182,9 @@ def filter_matches(matches: Matches, run: MatchFilter) -> Verdicts:
     while start < matches.num_pairs or not parts:  # of no pairs there are verdicts too, empty ones
         fitting = int(np.searchsorted(ptr, ptr[start] + BLOCK_MATCHES, side="right")) - 1
         stop = min(max(fitting, start + 1), matches.num_pairs)  # a pair is never cut
-        output = run(select_pairs(matches, start, stop))
-        score = None if output.score is None else output.score.detach().double().numpy()
-        parts.append(Verdicts(output.inlier.numpy(), score, output.relation.numpy()))
+        parts.append(to_verdicts(run(select_pairs(matches, start, stop))))
         start = stop
-    columns = zip(*parts, strict=True)
-    return Verdicts(*(None if values[0] is None else np.concatenate(values) for values in columns))  # type: ignore[arg-type]
+    return concatenate(Verdicts, parts)
 
 
 def filter_each(items: Iterable[tuple[Key, Matches]], run: MatchFilter) -> Iterator[tuple[Key, Verdicts]]:

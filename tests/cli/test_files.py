@@ -8,7 +8,10 @@ import polars as pl
 import pytest
 
 from tensor_stereo.cli import main
+from tensor_stereo.datasets import render_pair
+from tensor_stereo.datasets.images import write_image
 from tests.cli.failing import fails
+from tests.cli.printed import printed_values
 
 
 def test_rendered_pairs_are_indexed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,3 +74,27 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.Ca
     fails(["report", str(tmp_path)], capsys, "no run")
     fails(["filter", str(tmp_path / "a.txt"), "--out", str(tmp_path / "b.txt")], capsys, "MATCHES", ".npz")
     fails(["filter", str(tmp_path / "a.csv"), "--out", str(tmp_path / "b.csv")], capsys, "a.csv")
+
+
+def test_filter_repairs_and_refines_with_a_folder_of_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pair = render_pair(2)
+    for name, image in (("a.png", pair.image0), ("b.png", pair.image1)):
+        write_image(tmp_path / name, image)
+    left, right = (str(tmp_path / name) for name in ("a.png", "b.png"))
+    main(["classify", left, right, "--detector", "fast", "--out", str(tmp_path / "m.csv")])
+    table = pl.read_csv(tmp_path / "m.csv").with_columns(image0=pl.lit("a.png"), image1=pl.lit("b.png"))
+    table.write_csv(tmp_path / "m.csv")
+    capsys.readouterr()
+    command = ["filter", str(tmp_path / "m.csv"), "--out", str(tmp_path / "out.csv")]
+    main([*command, "--images", str(tmp_path)])
+    printed = printed_values(capsys)
+    assert not any(name in printed for name in ("num_improved", "num_refined", "num_repaired"))
+    main([*command, "--images", str(tmp_path), "--repair", "--refine"])
+    improved = printed_values(capsys)
+    assert improved["num_kept"] == printed["num_kept"]  # of those given
+    assert int(improved["num_improved"]) > int(improved["num_kept"])
+    assert int(improved["num_repaired"]) + int(improved["num_refined"]) <= int(improved["num_improved"])
+    assert min(int(improved[name]) for name in ("num_repaired", "num_refined")) > 0
+    found = pl.read_csv(tmp_path / "out.csv")
+    assert found["improved_inlier"].sum() == int(improved["num_improved"])
+    fails([*command, "--repair"], capsys, "images must be the folder of the images for repair")

@@ -17,7 +17,6 @@ import torch
 
 import tensor_stereo as ts
 from tensor_stereo.datasets import find_pairs, read_calibration
-from tensor_stereo.dense import interpolate_disparity
 from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import TOLERANCES_PX, LearnedScore, consensus_belief, load_learned, measure_images
 
@@ -25,19 +24,16 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packa
 from accuracy.dense_figures import draw_bars, draw_maps
 from accuracy.peers import score_disparity, score_lpm
 from accuracy.putatives import GrayPair, Putatives, find_putatives, load_pairs, to_matches
+from accuracy.uses import BAD_PX, FITS, epipolar_distances, is_known, map_errors
 from shared.harness import Suite
 from training.scenes import fold_of
 from training.work_folder import load_fold_networks
 
 DETECTORS = ("sift", "fast", "gftt")
-BAD_PX = 2.0
 MIN_GAP = 0.002  # of bad-2px, between the best peer and the oracle
 MAX_STEP_PX = 4.0  # where triangles are cut; of 2, 4, 8 and 16 the best on the training scenes
 NUM_THRESHOLDS = 13  # quantiles of each other score, of correct and of other matches of the training scenes
 PROBABILITIES = np.arange(1, 20) / 20  # thresholds of the learned score, which mean the same for all kinds of matches
-GRID_PX = 8  # of ground-truth correspondences for the epipolar distance
-RANSAC_ERROR_PX, CONFIDENCE = 1.0, 0.999
-FITS = {"8-point": cv2.FM_8POINT, "LMedS": cv2.FM_LMEDS, "RANSAC": cv2.FM_RANSAC}
 PEERS = ("LPM", "libviso2 support", "disparity median, Delaunay")
 OURS = ("topology", "consensus", "learned")
 SCORES = (*PEERS, *OURS)
@@ -69,48 +65,20 @@ def score_filters(pair: GrayPair, one: Putatives, network: LearnedScore) -> Scor
     return scores | {"LPM": score_lpm(one)} | {name: peers[name] for name in PEERS[1:]}
 
 
-def map_errors(
+def errors_of(
     pair: GrayPair, one: Putatives, kept: Rows, max_step_px: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The dense map, 0 without any anchor, and its absolute errors where the ground truth is known."""
-    matches, inlier = to_matches([one]), torch.from_numpy(kept)
-    dense = interpolate_disparity(matches, one.size, inlier=inlier, max_step_px=max_step_px)
-    found, truth = dense[0, 0].nan_to_num(0).numpy(), pair.disparity_gt
-    return found, np.abs(found - truth)[is_known(truth)]
-
-
-def is_known(truth: np.ndarray) -> np.ndarray:
-    return np.isfinite(truth) & (truth > 0)
+    """The dense map of the kept matches, and its errors."""
+    return map_errors(pair, to_matches([one]), torch.from_numpy(kept), max_step_px)
 
 
 def measure_maps(pair: GrayPair, one: Putatives, kept: Rows, max_step_px: float | None = None) -> dict[str, float]:
-    error = map_errors(pair, one, kept, max_step_px)[1]
+    error = errors_of(pair, one, kept, max_step_px)[1]
     return {"bad2": float((error > BAD_PX).mean()), "epe_px": float(error.mean()), "anchors": float(kept.sum())}
 
 
 def measure_geometry(pair: GrayPair, one: Putatives, kept: Rows) -> dict[str, float]:
-    """Mean symmetric epipolar distance of true correspondences in px, for each way to fit; infinite if it fails."""
-    y, x = (axis.ravel() for axis in np.mgrid[0 : one.size[0] : GRID_PX, 0 : one.size[1] : GRID_PX])
-    disparity = pair.disparity_gt[y, x]
-    known = is_known(disparity)
-    ones = np.ones(int(known.sum()))
-    truth0 = np.stack([x[known], y[known], ones], 1)
-    truth1 = np.stack([x[known] - disparity[known], y[known], ones], 1)
-    views = [np.ascontiguousarray(points[kept]) for points in (one.points0, one.points1)]
-    errors = {}
-    for name, method in FITS.items():
-        cv2.setRNGSeed(0)
-        fitted = None
-        if kept.sum() >= 8:
-            fitted, _ = cv2.findFundamentalMat(*views, method, RANSAC_ERROR_PX, CONFIDENCE)
-        if fitted is None or fitted.shape != (3, 3):
-            errors[name] = np.inf
-            continue
-        line0, line1 = truth1 @ fitted, truth0 @ fitted.T
-        residual = np.abs((truth1 * line1).sum(1))
-        lengths = (np.linalg.norm(line[:, :2], axis=1).clip(1e-12) for line in (line0, line1))
-        errors[name] = float(np.mean([(residual / length).mean() for length in lengths]))
-    return errors
+    return epipolar_distances(pair, to_matches([one]), torch.from_numpy(kept))
 
 
 def try_thresholds(cases: list[Case]) -> Tried:
@@ -176,7 +144,7 @@ def report(suite: Suite, title: str, table: dict[str, dict[str, np.ndarray]], th
 def measure_depth(pair: GrayPair, one: Putatives, kept: Rows, doffs_px: float) -> dict[str, float]:
     """Error of the depth of the dense map, relative to the true depth."""
     known = is_known(pair.disparity_gt)
-    found = map_errors(pair, one, kept)[0][known] + doffs_px
+    found = errors_of(pair, one, kept)[0][known] + doffs_px
     error = np.abs((pair.disparity_gt[known] + doffs_px) / found.clip(1e-6) - 1)  # depth is a constant / these
     return {"median": float(np.median(error)), "above_10_percent": float((error > 0.1).mean())}
 
@@ -220,7 +188,7 @@ def show_maps(case: Case, best: dict[str, float]) -> None:
     shown = {}
     for name in SHOWN:
         kept = keep(scores, name, best)
-        values, error = map_errors(pair, one, kept)
+        values, error = errors_of(pair, one, kept)
         shown[name] = values, one.points0[kept], float((error > BAD_PX).mean())
     draw_maps(pair.scene, np.where(is_known(pair.disparity_gt), pair.disparity_gt, np.nan), shown)
 

@@ -29,6 +29,7 @@ from tensor_stereo.types import Matches
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from accuracy.putatives import GrayPair, load_pairs
 from accuracy.sparse_peers import Result, guide_matches, refine_by_correlation, score_neighbors
+from accuracy.uses import BAD_PX, FITS, epipolar_distances, map_errors
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
 from training.putatives import FIXED
@@ -52,11 +53,13 @@ def run_methods(pair: GrayPair, detector: str, network: LearnedScore) -> tuple[d
     maps = match_semi_global(*views, SGBMConfig())
     sgbm = sample_disparity(maps.disparity0, keypoints.double(), features.ptr, disparity1=maps.disparity1)
     found = {
-        "SSD, LPM": Result(ssd, score_neighbors(ssd, "LPM")),
-        "SSD, libviso2": Result(ssd, score_neighbors(ssd, "libviso2")),
+        "SSD, LPM": score_neighbors(ssd, "LPM"),
+        "SSD, libviso2": score_neighbors(ssd, "libviso2"),
+        "SSD, oracle": Result(ssd, (errors_of(pair, ssd) <= TOLERANCE_PX).double()),
     }
     found["SSD, guided by epipolar lines"] = guide_matches(ssd, gray[0], config)
-    found["SGBM, left-right check"] = Result(sgbm, -sgbm.cost)
+    found["SGBM, left-right check"] = Result(sgbm, -sgbm.cost, keep_at=-TOLERANCE_PX)
+    found["SGBM, oracle"] = Result(sgbm, (errors_of(pair, sgbm) <= TOLERANCE_PX).double())
     for name, matches in (("SSD", ssd), ("SGBM", sgbm)):
         consensus = score_matches(matches, FilterConfig(score="consensus"))
         found[f"{name}, consensus"] = Result(matches, consensus.score, is_probability=True)
@@ -102,22 +105,27 @@ def visible_of(pair: GrayPair, keypoints: torch.Tensor, second: np.ndarray | Non
     return known & seen, known & hidden
 
 
+def errors_of(pair: GrayPair, matches: Matches) -> torch.Tensor:
+    return errors_against_gt(matches, torch.from_numpy(pair.disparity_gt)[None])
+
+
 def measure(result: Result, pair: GrayPair, keypoints: torch.Tensor, second: np.ndarray | None) -> dict[str, float]:
-    error = errors_against_gt(result.matches, torch.from_numpy(pair.disparity_gt)[None])
+    error = errors_of(pair, result.matches)
     known, correct = ~error.isnan(), error <= TOLERANCE_PX
     visible, _ = visible_of(pair, keypoints.double(), second)
     values = {
         f"correct_at_{round(100 * p)}": float(count_correct(result.score[known], correct[known], p)) for p in PRECISIONS
     }
     values["recall_at_95"] = values["correct_at_95"] / max(int(visible.sum()), 1)
-    if result.is_probability:
-        kept = known & (result.score >= LIKELY)
-        near = kept & (error <= 2)
-        values |= {"kept_error_px": float(error[kept].mean()), "near_error_px": float(error[near].mean())}
-        values["kept_precision"] = float(correct[kept].double().mean())
-        _, is_hidden = visible_of(pair, result.matches.keypoints0.double(), second)
-        if second is not None and bool(is_hidden.any()):
-            values["hidden_kept"] = float((is_hidden & (result.score >= LIKELY)).sum() / is_hidden.sum())
+    kept = known & result.kept
+    near = kept & (error <= 2)
+    values |= {"kept_error_px": float(error[kept].mean()), "near_error_px": float(error[near].mean())}
+    values["kept_precision"] = float(correct[kept].double().mean())
+    values["bad2"] = float((map_errors(pair, result.matches, result.kept)[1] > BAD_PX).mean())
+    values |= epipolar_distances(pair, result.matches, result.kept)
+    _, is_hidden = visible_of(pair, result.matches.keypoints0.double(), second)
+    if second is not None and bool(is_hidden.any()):
+        values["hidden_kept"] = float((is_hidden & result.kept).sum() / is_hidden.sum())
     return values
 
 
@@ -132,11 +140,12 @@ def report(
         for name, result in found.items():
             figures.setdefault(name, []).append(measure(result, pair, keypoints, twins.get(pair.scene)))
             if result.repaired is not None:
-                error = errors_against_gt(result.matches, torch.from_numpy(pair.disparity_gt)[None])
+                error = errors_of(pair, result.matches)
                 rows = result.repaired & ~error.isnan() & (result.score > 0)
                 pooled.setdefault(name, []).append((result.score[rows], error[rows] <= TOLERANCE_PX))
     for name, values in figures.items():
-        means = {key: float(np.nanmean([v[key] for v in values if key in v])) for key in values[0]}
+        middle = {key: np.median if key in FITS else np.nanmean for key in dict.fromkeys(k for v in values for k in v)}
+        means = {key: float(take([v[key] for v in values if key in v])) for key, take in middle.items()}
         if name in pooled:
             means["calibration_error_of_repaired"] = calibration_error(
                 *(torch.cat(x) for x in zip(*pooled[name], strict=True))

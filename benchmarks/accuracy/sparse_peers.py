@@ -9,12 +9,20 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from accuracy.peers import MAGSAC_CONFIDENCE, MAGSAC_ERROR_PX, MAGSAC_ITERATIONS, score_disparity, score_lpm
+from accuracy.peers import (
+    LPM_COST,
+    MAGSAC_CONFIDENCE,
+    MAGSAC_ERROR_PX,
+    MAGSAC_ITERATIONS,
+    score_disparity,
+    score_lpm,
+)
 from accuracy.putatives import Putatives
 from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.features import detect_features
 from tensor_stereo.types import Matches
 
+LEAST_SUPPORT = 4.0  # neighbours of like flow, libviso2's matcher
 LINE_PX = 4.0  # COLMAP's default for guided matching
 PATCH_RADIUS_PX, SEARCH_STEPS, SEARCH_PX = 7, 9, 1.0
 NUM_NEIGHBORS = 6
@@ -27,16 +35,24 @@ class Result(NamedTuple):
     score: torch.Tensor
     repaired: torch.Tensor | None = None  # (M,) bool
     is_probability: bool = False
+    keep_at: float = 0.5  # the least score of kept matches
+
+    @property
+    def kept(self) -> torch.Tensor:
+        """(M,) bool"""
+        return self.score >= self.keep_at
 
 
-def score_neighbors(matches: Matches, name: str) -> torch.Tensor:
-    """LPM's or libviso2's score of one pair."""
+def score_neighbors(matches: Matches, name: str) -> Result:
+    """LPM's or libviso2's score of one pair, with the threshold of their authors."""
     points = [view.double().numpy() for view in (matches.keypoints0, matches.keypoints1)]
     nothing = np.full(len(points[0]), np.nan)
     flags = np.ones(len(points[0]), bool)
     blank = np.zeros((2, 2), np.uint8)
     given = Putatives("", *points, nothing, nothing, flags, flags, nothing, nothing, (blank, blank))
-    return torch.from_numpy(score_lpm(given) if name == "LPM" else score_disparity(given)["libviso2 support"])
+    if name == "LPM":
+        return Result(matches, torch.from_numpy(score_lpm(given)), keep_at=-LPM_COST)
+    return Result(matches, torch.from_numpy(score_disparity(given)["libviso2 support"]), keep_at=LEAST_SUPPORT)
 
 
 def guide_matches(matches: Matches, gray: tuple[torch.Tensor, ...], config: PipelineConfig) -> Result:
@@ -60,7 +76,7 @@ def guide_matches(matches: Matches, gray: tuple[torch.Tensor, ...], config: Pipe
     back = ssd.min(0).indices
     rows = (best.isfinite() & (back[partner] == torch.arange(len(left)))).nonzero()[:, 0]
     found = Matches(left[rows], right[partner[rows]], torch.tensor([0, len(rows)]))
-    return Result(found, -best[rows].double())
+    return Result(found, -best[rows].double(), keep_at=-torch.inf)
 
 
 def refine_by_correlation(matches: Matches, gray: tuple[torch.Tensor, ...], kept: torch.Tensor) -> Matches:

@@ -5,4 +5,5 @@ NB_MODULE(_kernels, module) {
     bindings::bind_graphs(module);
     bindings::bind_soft(module);
     bindings::bind_matches(module);
+    bindings::bind_images(module);
 }

@@ -116,6 +116,6 @@ def score_matches(
     else:
         if images is not None:
             domain |= check_images(matches, images)
-            evidence = measure_images(*images, matches, graphs, alignment)
+            evidence = measure_images(*images, matches, graphs, alignment, backend=config.backend)
         cumulative = learned_probabilities(matches, graphs, evidence, config, alignment=alignment, network=network)
     return ScoredMatches(probability_within(cumulative, config.max_error_px), graphs, cumulative, alignment, domain)

@@ -16,40 +16,21 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
+from tensor_stereo.configs import Backend
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, check_match_graphs
+from tensor_stereo.ops._window_evidence import window_evidence
+from tensor_stereo.ops.reference_evidence import DISC_PX, NEAR_PX, NUM_CURVES, NUM_VALUES
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, no_alignment
-from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs, search_line
+from tensor_stereo.scores.samplers import find_places, prepare_views
 from tensor_stereo.scores.slopes import estimate_slopes
-from tensor_stereo.scores.windows import (
-    LIKE,
-    MIDDLE,
-    NUM_HALVES,
-    NUM_WHOLE,
-    RADIUS_PX,
-    TIGHT,
-    compare_windows,
-    lowest_place,
-    window_kernels,
-)
 from tensor_stereo.types import Matches
 
+__all__ = ["MAX_DISPARITIES", "NUM_CURVES", "NUM_VALUES", "ImageEvidence", "measure_images", "search_ranges"]
+
 MAX_DISPARITIES = 256  # of one pair's search range
-_NEAR_PX = 3  # disparities on either side of the match that are looked at one by one
-_SAME_PX = 2  # a rival is farther from the match than that
-_DISC_PX = 4  # radius of the disc that is searched where no rows are known
-_DISC_PLACES = 2 * _DISC_PX + 1
-_NOWHERE = 20.0  # log SSD of a place outside of the image
-_TIE = 1e-3  # log SSDs that near are alike; rounding must not choose between them
-_MAX_LOG = 6.0  # log ratios of SSDs are cut there
-_ROWS_AT_ONCE = 192  # matches whose windows stay in the cache
-_SLANTED = (MIDDLE, LIKE)  # the windows that are also compared along the slope of the surface
-_CURVES = (LIKE, TIGHT)  # those whose curve along the row is kept, for the disparities of the neighbours
-NUM_CURVES = len(_CURVES)
-_NUM_PLACES = 2 * _NEAR_PX + 1
-NUM_VALUES = 2 * (NUM_WHOLE * (_NUM_PLACES + 7) + 2 * NUM_HALVES + 1 + len(_SLANTED) * (_NUM_PLACES + 3)) + 2
+_DISC_PLACES = 2 * DISC_PX + 1
 
 
 class ImageEvidence(NamedTuple):
@@ -91,6 +72,8 @@ def measure_images(
     matches: Matches,
     graphs: MatchGraphs,
     alignment: Alignment | None = None,
+    *,
+    backend: Backend = "auto",
 ) -> ImageEvidence:
     """Hold the windows of every match against each other and against the rows that they lie in.
 
@@ -103,6 +86,7 @@ def measure_images(
         alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views. View 1
             of pairs that are not rectified is seen in the frame of view 0, in px of view 0, and searched along epipolar
             lines; where there are none, up to 4 px around the match.
+        backend: A name of :mod:`tensor_stereo.ops.backends`; both agree to 1e-4.
 
     Returns:
         One row per match, on the device of the keypoints; it does not depend on the other pairs. No gradient.
@@ -126,22 +110,31 @@ def measure_images(
         alignment = no_alignment(matches.num_pairs, matches.keypoints0)
     aligned = align_matches(matches, alignment)
     places = find_places(matches, aligned, estimate_slopes(aligned, graphs), alignment)
-    has_rows = alignment.has_rows.tolist()
     ranges = [
-        (first, count if known else min(count, _DISC_PLACES))
-        for (first, count), known in zip(search_ranges(aligned, graphs), has_rows, strict=True)
+        (first, count if has_rows else min(count, _DISC_PLACES))
+        for (first, count), has_rows in zip(search_ranges(aligned, graphs), alignment.has_rows.tolist(), strict=True)
     ]
-    width = max((count for _, count in ranges), default=0)
-    parts = [_empty(matches.keypoints0, width)]
-    with torch.autocast(matches.keypoints0.device.type, enabled=False):
-        for b, (samplers, own) in enumerate(look_at_pairs(views, matches, places, alignment)):
-            for row in range(0, len(own.left), _ROWS_AT_ONCE):
-                rows = slice(row, row + _ROWS_AT_ONCE)
-                looks = [sampler.select(rows) for sampler in samplers]
-                parts.append(_measure_both(looks, own.select(rows), *ranges[b], width, has_rows=has_rows[b]))
-    values, curve0, curve1, offset, first = (torch.cat(part) for part in zip(*parts, strict=True))
-    counts = torch.tensor([count for _, count in ranges], dtype=torch.int64, device=matches.ptr.device)
-    return ImageEvidence(values, curve0, curve1, first, counts.repeat_interleave(matches.ptr.diff()), offset)
+    device = matches.ptr.device
+    first, counts = torch.tensor(ranges, dtype=torch.int64, device=device).reshape(-1, 2).unbind(1)
+    pairs = list(prepare_views(views, matches, alignment))
+    nothing = torch.zeros(0, 0, dtype=torch.bool, device=device)
+    with torch.autocast(device.type, enabled=False):
+        values, curve0, curve1, start, offset = window_evidence(
+            [pair.image0 for pair in pairs],
+            [pair.image1 for pair in pairs],
+            [nothing if pair.known1 is None else pair.known1 for pair in pairs],
+            torch.stack([pair.origin for pair in pairs]) if pairs else torch.zeros(0, 2, device=device),
+            torch.tensor([pair.brighter for pair in pairs], dtype=torch.float32, device=device),
+            *places,
+            matches.ptr,
+            first,
+            counts,
+            alignment.has_rows,
+            alignment.rectified,
+            max((count for _, count in ranges), default=0),
+            backend,
+        )
+    return ImageEvidence(values, curve0, curve1, start, counts.repeat_interleave(matches.ptr.diff()), offset)
 
 
 def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]]:
@@ -176,120 +169,10 @@ def search_ranges(matches: Matches, graphs: MatchGraphs) -> list[tuple[int, int]
         first, last = math.floor(low - margin), math.ceil(high + margin)
         if last - first >= MAX_DISPARITIES:
             ordered = believed.sort().values
-            begin = ordered.floor() - _NEAR_PX
-            within = torch.searchsorted(ordered, begin + MAX_DISPARITIES - _NEAR_PX)
+            begin = ordered.floor() - NEAR_PX
+            within = torch.searchsorted(ordered, begin + MAX_DISPARITIES - NEAR_PX)
             within = within - torch.arange(len(ordered), device=ordered.device)
             first = int(begin[within.argmax()])
             last = first + MAX_DISPARITIES - 1
         ranges.append((first, last - first + 1))
     return ranges
-
-
-def _empty(like: Tensor, width: int) -> tuple[Tensor, ...]:
-    none = torch.zeros(0, dtype=torch.float32, device=like.device)
-    curve = none.reshape(0, NUM_CURVES, width)
-    return none.reshape(0, NUM_VALUES), curve, curve, none, none
-
-
-class _Found(NamedTuple):
-    """What the windows of one view say about m matches."""
-
-    columns: list[Tensor]
-    curve: Tensor  # (m, 2, D)
-    offset: Tensor  # (m,)
-
-
-def _measure_both(
-    looks: Sequence[Sampler], places: Place, first: int, count: int, width: int, *, has_rows: bool
-) -> tuple[Tensor, ...]:
-    """Values, both curves, the offset and the first disparity of m matches of one pair."""
-    points = places.left, places.right
-    start = places.disparity.round() - _DISC_PX if not has_rows else torch.full_like(places.disparity, first)
-    own = (places.disparity - start).round()  # column of the match
-    windows = [look.windows(view, RADIUS_PX) for look, view in zip(looks, points, strict=True)]
-    slope = places.slope
-    shears = -slope / (1 + slope[:, :1] / 2), slope / (1 - slope[:, :1] / 2)
-    # a rectified partner lies on the row of the window itself, but for the alignment
-    across = places.across, -places.across
-    found = [
-        _measure_one(
-            looks[1 - v], windows[v], points[v], across[v], points[1 - v], shears[v], start, own, count,
-            reverse=not v, has_rows=has_rows,
-        )
-        for v in (0, 1)
-    ]  # fmt: skip
-    levels = [window[:, 4:-4, 4:-4].mean((1, 2)) for window in windows]
-    brighter = (levels[0] - levels[1]).abs() / 16
-    beyond = torch.log1p((-own).clamp(min=0) + (own - count + 1).clamp(min=0)).clamp(max=5)
-    values = torch.cat([*found[0].columns, *found[1].columns, brighter[:, None], beyond[:, None]], 1)
-    curves = (functional.pad(one.curve, (0, width - count)) for one in found)
-    return values, *curves, (found[0].offset + found[1].offset) / 2, start
-
-
-def _measure_one(
-    other: Sampler,
-    windows: Tensor,
-    points: Tensor,
-    across: Tensor,
-    partners: Tensor,
-    shear: Tensor,
-    first: Tensor,
-    own: Tensor,
-    count: int,
-    *,
-    reverse: bool,
-    has_rows: bool,
-) -> _Found:
-    """What the windows of one view say; ``reverse``: disparity grows against the columns of the other view."""
-    kernels = window_kernels(windows)
-    whole = slice(0, NUM_WHOLE)
-
-    def compare(strips: Tensor, kernels: Tensor, *, has_tight: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-        cost, likeness, variance = compare_windows(windows, strips, kernels, has_tight=has_tight)
-        return (cost.flip(1), likeness.flip(1), variance) if reverse else (cost, likeness, variance)
-
-    cost, likeness, variance = compare(other.windows(partners, RADIUS_PX + _NEAR_PX), kernels)
-    mid, lowest = cost[:, _NEAR_PX], cost.amin(1)
-    slanted = other.slanted(partners, RADIUS_PX + _NEAR_PX, shear)
-    along, along_likeness, _ = compare(slanted, kernels[..., list(_SLANTED)], has_tight=False)
-    offset = lowest_place(along) * (1 + shear[:, :1])  # whose places are that far apart
-    rows = [0] if has_rows else list(range(-_DISC_PX, _DISC_PX + 1))
-    searched = []
-    for row in rows:
-        strips, outside = search_line(other, points, across + row, first, count, reverse=reverse)
-        far, far_likeness, _ = compare(strips, kernels[..., whole])
-        searched.append((far, far_likeness, outside.flip(1) if reverse else outside))
-    far, far_likeness, outside = (torch.cat(part, 1) for part in zip(*searched, strict=True))
-    place = torch.arange(count, device=own.device).repeat(len(rows))
-    below = torch.tensor(rows, device=own.device).repeat_interleave(count)
-    away = torch.hypot(place - own[:, None], below.float())
-    outside = (outside | ((away > _DISC_PX) & (not has_rows)))[..., None]
-    far, far_likeness = far.masked_fill(outside, _NOWHERE), far_likeness.masked_fill(outside, -1.0)
-    same = (away <= _SAME_PX)[..., None]
-    alone = (same | outside).all(1)
-    others = far.masked_fill(same, _NOWHERE)
-    away = away[..., None].expand_as(others)  # of equal rivals the nearest counts
-    rival = others.amin(1)
-    nearest = away.masked_fill(others > rival[:, None] + _TIE, 100).amin(1)
-    here, here_likeness = mid[:, whole], likeness[:, _NEAR_PX, whole]
-    margin = (rival - here).clamp(-_MAX_LOG, _MAX_LOG).masked_fill(alone, 0)
-    margin_likeness = (here_likeness - far_likeness.masked_fill(same, -1.0).amax(1)).masked_fill(alone, 0)
-    columns = [
-        (cost - lowest[:, None])[..., whole].flatten(1),
-        here,
-        here_likeness,
-        margin,
-        margin_likeness,
-        (~same & (far < here[:, None] + 0.3)).float().mean(1),
-        torch.log1p(nearest.clamp(max=100)).masked_fill(margin >= -_TIE, 0),
-        mid[:, NUM_WHOLE:],
-        (mid - lowest)[:, NUM_WHOLE:],
-        variance[:, whole],
-        torch.log1p(windows.diff(dim=2)[:, 3:-3, 3:-3].square().mean((1, 2)))[:, None],
-        (along - along.amin(1, keepdim=True)).flatten(1),
-        along[:, _NEAR_PX] - mid[:, list(_SLANTED)],
-        along_likeness[:, _NEAR_PX],
-        offset,
-    ]
-    curve = (far[:, below == 0] - here[:, None])[..., list(_CURVES)].clamp(-_MAX_LOG, _MAX_LOG)
-    return _Found(columns, curve.transpose(1, 2), offset.mean(1))

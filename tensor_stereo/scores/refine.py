@@ -15,11 +15,12 @@ from torch import Tensor
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs, check_match_graphs
+from tensor_stereo.ops.samplers import Sampler
+from tensor_stereo.ops.windows import NOISE_VARIANCE, RADIUS_PX, TIGHT, window_kernels
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, epipolar_frames, map_points, no_alignment
 from tensor_stereo.scores.repair import Origin
-from tensor_stereo.scores.samplers import Place, Sampler, blur, find_places, look_at_pairs
+from tensor_stereo.scores.samplers import Place, blur, find_places, look_at_pairs
 from tensor_stereo.scores.slopes import estimate_slopes
-from tensor_stereo.scores.windows import NOISE_VARIANCE, RADIUS_PX, TIGHT, window_kernels
 from tensor_stereo.types import Matches, check_mask, check_vector
 
 _BLUR = 1.4  # as in so many times fewer pixels; interpolation then smooths all places alike, which locks no pixel

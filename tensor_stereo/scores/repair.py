@@ -17,12 +17,9 @@ from tensor_stereo.batching import batch_to_ptr, ptr_to_batch, select_matches
 from tensor_stereo.delaunay.one_to_one import coincident_ids, first_of_coincident
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
+from tensor_stereo.ops.samplers import Sampler, search_line
 from tensor_stereo.ops.segments import to_points
-from tensor_stereo.scores.alignment.form import Alignment, align_matches, map_points, no_alignment
-from tensor_stereo.scores.image_evidence import MAX_DISPARITIES
-from tensor_stereo.scores.samplers import Place, Sampler, find_places, look_at_pairs, search_line
-from tensor_stereo.scores.slopes import estimate_slopes
-from tensor_stereo.scores.windows import (
+from tensor_stereo.ops.windows import (
     LIKE,
     NUM_WHOLE,
     RADIUS_PX,
@@ -31,6 +28,10 @@ from tensor_stereo.scores.windows import (
     parabola_offset,
     window_kernels,
 )
+from tensor_stereo.scores.alignment.form import Alignment, align_matches, map_points, no_alignment
+from tensor_stereo.scores.image_evidence import MAX_DISPARITIES
+from tensor_stereo.scores.samplers import Place, find_places, look_at_pairs
+from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.types import Matches, check_mask, check_points, check_ptr, check_vector
 
 _LEAST_KEPT = 4  # matches of a pair that predict for others

@@ -13,8 +13,9 @@ from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import to_gray
+from tensor_stereo.ops.samplers import LineSampler, RowSampler, Sampler
+from tensor_stereo.ops.windows import RADIUS_PX
 from tensor_stereo.scores.alignment.form import Alignment, epipolar_frames, map_points, turn_vectors
-from tensor_stereo.scores.windows import RADIUS_PX, sample_frames, sample_slanted, sample_strips, sample_windows
 from tensor_stereo.types import Matches
 
 _LEAST_BLUR_PX = 0.2  # less is none
@@ -72,156 +73,79 @@ def find_places(matches: Matches, aligned: Matches, slope: Tensor, alignment: Al
     return Place(matches.keypoints0.float(), right.float(), along, disparity, across.float(), slope)
 
 
-class RowSampler(NamedTuple):
-    """An image (H, W) that is looked at along its rows."""
+class PairViews(NamedTuple):
+    """The views of a pair, ready to be looked at.
 
-    image: Tensor
+    Attributes:
+        image0: (H, W) grey levels, uint8; float32 where view 1 was resampled.
+        image1: (H1, W1) likewise.
+        brighter: By how many grey levels view 1 is brighter.
+        origin: (2,) float32 px of view 0, where the first pixel of ``image1`` lies.
+        known1: (H1, W1) bool, inside of view 1; None: all.
+    """
 
-    def windows(self, centers: Tensor, radius_x: int) -> Tensor:
-        """(m, 15, 2 rx + 1) grey levels around centres (m, 2) px."""
-        return sample_windows(self.image, centers, radius_x)
+    image0: Tensor
+    image1: Tensor
+    brighter: float
+    origin: Tensor
+    known1: Tensor | None
 
-    def strips(self, start: Tensor, width: int) -> Tensor:
-        """(m, 15, width) grey levels of strips from ``start`` (m, 2) px on."""
-        return sample_strips(self.image, start[:, 0], start[:, 1], width)
-
-    def slanted(self, centers: Tensor, radius_x: int, shear: Tensor) -> Tensor:
-        """(m, 15, 2 rx + 1) grey levels of what a slanted surface moves there."""
-        return sample_slanted(self.image, centers, radius_x, shear)
-
-    def outside(self, start: Tensor, count: int) -> Tensor:
-        """(m, count) bool, which places from ``start`` on lie left or right of the image."""
-        x = start[:, :1] + torch.arange(count, device=start.device)
-        return (x < 0) | (x > self.image.shape[1] - 1)
-
-    def select(self, rows: slice | Tensor) -> RowSampler:  # noqa: ARG002  # as of other samplers
-        """That of some matches."""
-        return self
-
-    def place(self, points: Tensor, along: Tensor, across: Tensor) -> Tensor:
-        """(m, 2) px, points moved along and across the rows."""
-        return torch.stack([points[:, 0] + along, points[:, 1] + across], 1)
+    def look(self, along: Tensor) -> tuple[Sampler, Sampler]:
+        """How both are looked at, along the lines (m, 2) of the matches where they are not rectified."""
+        image0, image1 = self.image0.float(), self.image1.float() - self.brighter
+        if self.known1 is None:
+            return RowSampler(image0), RowSampler(image1)
+        known0 = torch.ones_like(image0, dtype=torch.bool)
+        return (
+            LineSampler(image0, torch.zeros_like(self.origin), along, known0),
+            LineSampler(image1, self.origin, along, self.known1),
+        )
 
 
-class LineSampler(NamedTuple):
-    """An image that is looked at along a direction of each match, and where it is known. Places are px of view 0."""
-
-    image: Tensor  # (H, W)
-    origin: Tensor  # (2,) px, where its first pixel lies
-    along: Tensor  # (m, 2) unit vectors
-    known: Tensor  # (H, W) bool
-
-    def windows(self, centers: Tensor, radius_x: int) -> Tensor:
-        """(m, 15, 2 rx + 1) grey levels around centres (m, 2) px, along the lines."""
-        return self._sample(centers, radius_x, self._axes())
-
-    def strips(self, start: Tensor, width: int) -> Tensor:
-        """(m, 15, width) grey levels of strips along the lines from ``start`` (m, 2) px on."""
-        offsets = torch.arange(width, device=start.device, dtype=torch.float32)
-        return sample_frames(self.image, start - self.origin, self._axes(), offsets)
-
-    def slanted(self, centers: Tensor, radius_x: int, shear: Tensor) -> Tensor:
-        """(m, 15, 2 rx + 1) grey levels of what a slanted surface moves there."""
-        u, v = self._axes().unbind(1)  # along and across
-        return self._sample(centers, radius_x, torch.stack([u * (1 + shear[:, :1]), v + u * shear[:, 1:]], 1))
-
-    def outside(self, start: Tensor, count: int) -> Tensor:
-        """(m, count) bool, which places from ``start`` on along the lines are not known."""
-        steps = torch.arange(count, device=start.device, dtype=torch.float32)
-        points = ((start - self.origin)[:, None] + steps[:, None] * self.along[:, None]).round().long()
-        size = points.new_tensor([self.known.shape[1], self.known.shape[0]])
-        inside = ((points >= 0) & (points < size)).all(2)
-        x, y = torch.where(inside[..., None], points, 0).unbind(2)
-        return ~inside | ~self.known[y, x]
-
-    def select(self, rows: slice | Tensor) -> LineSampler:
-        """That of some matches."""
-        return self._replace(along=self.along[rows])
-
-    def place(self, points: Tensor, along: Tensor, across: Tensor) -> Tensor:
-        """(m, 2) px, points moved along and across the lines."""
-        u, v = self._axes().unbind(1)
-        return points + along[:, None] * u + across[:, None] * v
-
-    def _axes(self) -> Tensor:
-        """(m, 2, 2) unit vectors along and across, y down."""
-        x, y = self.along.unbind(1)
-        return torch.stack([self.along, torch.stack([-y, x], 1)], 1)
-
-    def _sample(self, centers: Tensor, radius_x: int, axes: Tensor) -> Tensor:
-        offsets = torch.arange(-radius_x, radius_x + 1, device=centers.device, dtype=torch.float32)
-        return sample_frames(self.image, centers - self.origin, axes, offsets)
-
-
-Sampler = RowSampler | LineSampler
-
-
-def search_line(
-    look: Sampler, points: Tensor, across: Tensor, first: Tensor, count: int, *, reverse: bool
-) -> tuple[Tensor, Tensor]:
-    """Strips of the other view whose windows lie at some disparities of each point.
+def prepare_views(views: Sequence[Sequence[Tensor]], matches: Matches, alignment: Alignment) -> Iterator[PairViews]:
+    """Both views of each pair, view 1 in the frame of view 0 unless they are rectified.
 
     Args:
-        look: At the other view.
-        points: (m, 2) px.
-        across: (m,) px, how far across a point its line lies in the other view.
-        first: (m,) px, the least disparity; ``count`` - 1 px more is the greatest.
-        count: Number of disparities D.
-        reverse: Whether disparity grows against the columns: from view 0 to view 1.
-
-    Returns:
-        (m, 15, D + 14) grey levels, and (m, D) bool, which places lie outside; both along the columns, so that reversed
-        ones begin with the greatest disparity.
-
-    >>> look = RowSampler(torch.arange(9.0).expand(5, 9))
-    >>> search_line(look, torch.tensor([[4.0, 2.0]]), torch.zeros(1), torch.tensor([3.0]), 3, reverse=True)[1]
-    tensor([[ True, False, False]])
+        views: The B images (C, H, W) of view 0, and those of view 1, whose common change of brightness is told.
+        matches: B pairs.
+        alignment: What the matches of every pair share.
     """
-    begin = look.place(points, -(first + max(count - 1, 0)) if reverse else first, across)
-    before = look.place(begin, torch.full_like(first, -RADIUS_PX), torch.zeros_like(across))
-    return look.strips(before, count + 2 * RADIUS_PX), look.outside(begin, count)
+    device = matches.ptr.device
+    for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
+        image0, image1 = (to_gray(images[b][None])[0, 0].to(device) for images in views)
+        points = matches.keypoints0[start:stop], matches.keypoints1[start:stop]
+        brighter = _brighter((image0, image1), *points)
+        if bool(alignment.rectified[b]):
+            yield PairViews(image0, image1, brighter, torch.zeros(2, device=device), None)
+            continue
+        warped = warp_view(image0.float(), image1.float(), alignment.to_view0[b], points[1])
+        yield PairViews(warped.image0, warped.image1, brighter, warped.origin, warped.known1)
 
 
 def look_at_pairs(
     views: Sequence[Sequence[Tensor]], matches: Matches, places: Place, alignment: Alignment
 ) -> Iterator[tuple[tuple[Sampler, Sampler], Place]]:
-    """How both views of each pair are looked at, and the places of its matches.
-
-    Args:
-        views: The B images (C, H, W) of view 0, and those of view 1, whose common change of brightness is taken out.
-        matches: B pairs.
-        places: Those of all matches.
-        alignment: What the matches of every pair share.
-    """
-    for b, (start, stop) in enumerate(pairwise(matches.ptr.tolist())):
-        gray = [to_gray(images[b][None])[0, 0].float().to(matches.ptr.device) for images in views]
-        points = matches.keypoints0[start:stop], matches.keypoints1[start:stop]
-        gray[1] = gray[1] - _brighter(gray, *points)
+    """How both views of each pair are looked at, and the places of its matches; arguments as before."""
+    ranges = pairwise(matches.ptr.tolist())
+    for (start, stop), pair in zip(ranges, prepare_views(views, matches, alignment), strict=True):
         own = places.select(slice(start, stop))
-        if bool(alignment.rectified[b]):
-            yield (RowSampler(gray[0]), RowSampler(gray[1])), own
-            continue
-        warped = warp_view(gray[0], gray[1], alignment.to_view0[b], points[1])
-        known0 = torch.ones_like(gray[0], dtype=torch.bool)
-        looks = (
-            LineSampler(warped.image0, torch.zeros_like(warped.origin), own.along, known0),
-            LineSampler(warped.image1, warped.origin, own.along, warped.known1),
-        )
-        yield looks, own
+        yield pair.look(own.along), own
 
 
-def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> Tensor:
-    """() by how many grey levels view 1 is brighter, the median over the matches of a pair."""
+def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> float:
+    """By how many grey levels view 1 is brighter, the median over the matches of a pair, of 5 x 5 px each."""
     if not len(points0):
-        return gray[0].new_zeros(())
+        return 0.0
+    around = torch.arange(-2, 3, device=points0.device)
     levels = []
     for image, points in zip(gray, (points0, points1), strict=True):
-        smooth = functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[0, 0]
-        x, y = (
-            place.round().clamp(0, size - 1).long() for place, size in zip(points.t(), smooth.t().shape, strict=True)
-        )
-        levels.append(smooth[y, x])
-    return torch.quantile(levels[1] - levels[0], 0.5)  # the same in a mirror, unlike the lower median
+        height, width = image.shape
+        x, y = (place.round().long() for place in points.unbind(1))
+        x, y = (place.clamp(0, size - 1)[:, None] + around for place, size in ((x, width), (y, height)))
+        known = ((x >= 0) & (x < width))[:, None] & ((y >= 0) & (y < height))[:, :, None]
+        found = image[y.clamp(0, height - 1)[:, :, None], x.clamp(0, width - 1)[:, None]].double() * known
+        levels.append(found.sum((1, 2)) / known.sum((1, 2)))
+    return float(torch.quantile(levels[1] - levels[0], 0.5))  # the same in a mirror, unlike the lower median
 
 
 class WarpedView(NamedTuple):

@@ -118,7 +118,7 @@ def _measure_view(
             best = rivals[row[0][rivals, k].argmin()]
             margin[k] = np.clip(row[0][best, k] - at[k], -6, 6)
             margin_likeness[k] = likeness[3, k] - max(-1, row[1][rivals, k].max())
-            crowd[k] = (row[0][rivals, k] < at[k] + 0.3).sum() / len(column)
+            crowd[k] = ((at[k] + 0.3 - row[0][rivals, k]) / 0.1 + 0.5).clip(0, 1).sum() / len(column)
             alike = rivals[row[0][rivals, k] <= row[0][best, k] + 1e-3]  # of which the nearest counts
             distance[k] = np.log1p(min(apart[alike].min(), 100)) if margin[k] < -1e-3 else 0
     variance = [(kernel * (window - (kernel * window).sum()) ** 2).sum() for kernel in kernels[:4]]
@@ -134,11 +134,12 @@ def _measure_view(
 
 def _lowest_place(ssd: np.ndarray) -> tuple[float, bool]:
     """Where the parabola through the least of seven values is lowest, and whether that is far from another answer."""
-    k = int(np.clip(ssd.argmin(), 1, 5))
+    alike = [k for k in range(7) if ssd[k] <= ssd.min() * 1.001]
+    k = int(np.clip(min(alike, key=lambda k: abs(k - 3)), 1, 5))
     before, least, after = ssd[k - 1 : k + 2]
     bend = before - 2 * least + after
     runner_up = np.sort(ssd)[1]
-    return k - 3 + np.clip((before - after) / (2 * max(bend, 1e-3)), -1, 1), bend > 2 and runner_up - ssd.min() > 0.05
+    return k - 3 + np.clip((before - after) / (2 * max(bend, 0.03 * least)), -1, 1), runner_up > 1.002 * ssd.min()
 
 
 def _sample(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -157,7 +158,7 @@ def _kernels(window: np.ndarray) -> list[np.ndarray]:
     halves = [middle & side for side in (COLUMN <= 1, COLUMN >= -1, ROW <= 1, ROW >= -1)]
     similar = np.exp(-unlike - (ROW**2 + COLUMN**2) / 40) + 1e-4
     tight = np.exp(-abs(window - window[7, 7]) / 10 - (ROW**2 + COLUMN**2) / 8) + 1e-5
-    kernels = [(abs(ROW) <= 2) & (abs(COLUMN) <= 2), middle, similar, tight, *halves]
+    kernels = [(abs(ROW) <= 2) & (abs(COLUMN) <= 2), middle, similar, tight * middle, *halves]
     return [kernel / kernel.sum() for kernel in kernels]
 
 

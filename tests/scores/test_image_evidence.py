@@ -20,10 +20,11 @@ from tests.oracles import neighbor_sets
 from tests.scores.evidence_oracle import brightness, measure_match, search_range, slope_at
 from tests.scores.learned_oracle import random_pairs
 
-# Levels are centred on the mean of one window; where the other one lies 100 levels away, squares reach 1e4. float32
-# keeps sums of 225 such products to about sqrt(225) * 2^-24 * 1e4 = 1e-2 squared levels, and the logarithm of the
-# mean is taken from 2 squared levels on: 5e-3, or twice that for a difference of two logarithms.
-ATOL = 1e-2
+# Grey levels count from the pixel in the middle of each window. Where the others lie 100 levels away, squares reach 1e4,
+# whose weighted sums float32 keeps to about sqrt(225) * 2^-24 * 1e4 / 15 = 6e-4 squared levels; the logarithm of the
+# difference is taken from 2 squared levels on: 3e-4, or twice that for a difference of two logarithms.
+ATOL = 6e-4
+BACKENDS = ("native", "scipy")
 HEIGHT, WIDTH = 60, 80
 SIDE = (NUM_VALUES - 2) // 2
 NAMES = ["near"] * 28 + ["whole"] * 4 + ["likeness"] * 4 + ["margin"] * 4 + ["margin_likeness"] * 4 + ["crowd"] * 4
@@ -105,8 +106,8 @@ def assert_same(
             assert not given[row, :, count:].any()
 
 
-def measure(matches: Matches, *views: list[Tensor]) -> ImageEvidence:
-    return measure_images(*views, matches, build_match_graphs(matches))
+def measure(matches: Matches, *views: list[Tensor], backend: str = "auto") -> ImageEvidence:
+    return measure_images(*views, matches, build_match_graphs(matches), backend=backend)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tensor_stereo.scores.windows import (
+from tensor_stereo.ops.windows import (
     RADIUS_PX,
     TIGHT,
     compare_windows,

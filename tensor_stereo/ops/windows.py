@@ -10,6 +10,9 @@ NOISE_VARIANCE = 2.0  # grey levels squared; keeps windows without texture from 
 _LIKENESS_LEVELS, _LIKENESS_PX2 = 12.0, 40.0  # fall-off of the weights of pixels unlike the 3 x 3 px in the middle
 _TIGHT_LEVELS, _TIGHT_PX2 = 10.0, 8.0  # the same around the pixel in the middle alone
 SMALL, MIDDLE, LIKE, TIGHT = range(4)  # whole windows, which are also held against the row
+TIE = 1e-3  # log SSDs that near are alike; rounding must not choose between them
+_LEAST_BEND = 0.03  # of the parabola through three SSDs, of the least one; less is noise
+_FAR_PX = 4e6  # coordinates beyond lie outside of every image
 NUM_WHOLE, NUM_HALVES = 4, 4  # half windows come behind the whole ones
 
 
@@ -53,24 +56,10 @@ def sample_slanted(image: Tensor, centers: Tensor, radius_x: int, shear: Tensor)
     >>> sample_slanted(torch.arange(9.0).expand(5, 9), torch.tensor([[4.0, 2.0]]), 1, torch.tensor([[0.5, 0.0]]))[0, 7]
     tensor([2.5000, 4.0000, 5.5000])
     """
-    v = torch.arange(-RADIUS_PX, RADIUS_PX + 1, device=image.device, dtype=torch.float32)[:, None]
-    u = torch.arange(-radius_x, radius_x + 1, device=image.device, dtype=torch.float32)
-    x, y = (part[:, None, None] for part in centers.unbind(1))
-    along_x, along_y = (part[:, None, None] for part in shear.unbind(1))
-    return _bilinear(image, x + u + along_x * u + along_y * v, y + v)
-
-
-def _bilinear(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Grey levels at places that broadcast; the border is repeated."""
-    height, width = image.shape
-    x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
-    x0, y0 = x.floor(), y.floor()
-    fx, fy = x - x0, y - y0
-    left, top = x0.long(), y0.long()
-    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
-    flat = image.reshape(-1)
-    upper, lower = (flat[row * width + left] * (1 - fx) + flat[row * width + right] * fx for row in (top, bottom))
-    return upper + fy * (lower - upper)
+    none, one = torch.zeros_like(shear[:, 0]), torch.ones_like(shear[:, 0])
+    axes = torch.stack([torch.stack([1 + shear[:, 0], none], 1), torch.stack([shear[:, 1], one], 1)], 1)
+    offsets = torch.arange(-radius_x, radius_x + 1, device=image.device, dtype=torch.float32)
+    return sample_frames(image, centers, axes, offsets)
 
 
 def sample_frames(image: Tensor, origins: Tensor, axes: Tensor, offsets: Tensor) -> Tensor:
@@ -89,18 +78,33 @@ def sample_frames(image: Tensor, origins: Tensor, axes: Tensor, offsets: Tensor)
     """
     rows = torch.arange(-RADIUS_PX, RADIUS_PX + 1, device=image.device, dtype=torch.float32)
     along, across = axes.unbind(1)
+    height, width = image.shape
+    base = origins.clamp(-_FAR_PX, _FAR_PX).floor()  # places count from there: small numbers keep their digits
     x, y = (
-        origins[:, k, None, None] + offsets * along[:, k, None, None] + rows[:, None] * across[:, k, None, None]
+        (origins - base)[:, k, None, None]
+        + offsets * along[:, k, None, None]
+        + rows[:, None] * across[:, k, None, None]
         for k in (0, 1)
     )
-    return _bilinear(image, x, y)
+    left, top = (base[:, k, None, None] for k in (0, 1))
+    x, y = (
+        torch.minimum(torch.maximum(place, -begin), size - 1 - begin)
+        for place, begin, size in ((x, left, width), (y, top, height))
+    )
+    x0, y0 = x.floor(), y.floor()
+    fx, fy = x - x0, y - y0
+    u, v = (left + x0).long().clamp(0, width - 1), (top + y0).long().clamp(0, height - 1)
+    right, below = (u + 1).clamp(max=width - 1), (v + 1).clamp(max=height - 1)
+    flat = image.reshape(-1)
+    upper, lower = (flat[row * width + u] * (1 - fx) + flat[row * width + right] * fx for row in (v, below))
+    return upper + fy * (lower - upper)
 
 
 def window_kernels(windows: Tensor) -> Tensor:
     """(m, 225, 8) weights with sum 1 of the pixels of m windows.
 
-    5 x 5 and 11 x 11 boxes; pixels like the 3 x 3 px in the middle (Yoon & Kweon 2006); pixels near the middle and like
-    it, which keep to one side of an edge; and the left, right, upper and lower half of 11 x 11.
+    5 x 5 and 11 x 11 boxes; pixels like the 3 x 3 px in the middle (Yoon & Kweon 2006); of 11 x 11 those near the middle
+    and like it, which keep to one side of an edge; and the left, right, upper and lower half of 11 x 11.
 
     >>> window_kernels(torch.rand(2, 15, 15)).sum(1)[0, :3]
     tensor([1.0000, 1.0000, 1.0000])
@@ -116,6 +120,7 @@ def window_kernels(windows: Tensor) -> Tensor:
     center = windows[:, RADIUS_PX - 1 : RADIUS_PX + 2, RADIUS_PX - 1 : RADIUS_PX + 2].mean((1, 2))
     like = _likeness(windows, center, _LIKENESS_LEVELS, far / _LIKENESS_PX2) + 1e-4
     tight = _likeness(windows, windows[:, RADIUS_PX, RADIUS_PX], _TIGHT_LEVELS, far / _TIGHT_PX2) + 1e-5
+    tight = tight * middle
     weights = torch.cat([boxes, like, tight, halves.float().expand(len(windows), -1, -1, -1)], 1).flatten(2)
     return (weights / weights.sum(2, keepdim=True)).transpose(1, 2)
 
@@ -138,20 +143,21 @@ def compare_windows(
     >>> compare_windows(windows, windows, window_kernels(windows), has_tight=True)[0].exp().round()
     tensor([[[2., 2., 2., 2., 2., 2., 2., 2.]]])
     """
-    side, k = windows.shape[1], kernels.shape[2]
-    level = windows.mean((1, 2))[:, None, None]  # near zero the squares keep their digits
-    anchor = (windows - level).flatten(1)[..., None]
-    moving = (strips - level).unfold(2, side, 1).transpose(1, 2).reshape(len(strips), -1, side * side)
-    sums = moving @ torch.cat([kernels, kernels * anchor], 2)
-    squares = moving.square_() @ kernels
-    mean, product = sums[..., :k], sums[..., k:]
-    anchor_mean = (kernels * anchor).sum(1)
-    anchor_variance = ((kernels * anchor.square()).sum(1) - anchor_mean.square()).clamp(min=0)
-    variance = (squares - mean.square()).clamp(min=0)
-    covariance = product - mean * anchor_mean[:, None]
-    difference = (variance + anchor_variance[:, None] - 2 * covariance).clamp(min=0)
+    side = windows.shape[1]
+    # Levels count from the pixel in the middle, and squares from differences: both are small where windows are alike.
+    level = windows[:, side // 2, side // 2]
+    anchor = (windows - level[:, None, None]).flatten(1)
+    moving = strips.unfold(2, side, 1).transpose(1, 2).reshape(len(strips), -1, side * side)
+    shift = moving[..., side * side // 2]
+    moving = moving - shift[..., None]
+    mean, anchor_mean = moving @ kernels, anchor[:, None] @ kernels
+    gap = anchor_mean - mean
+    difference = ((anchor[:, None] - moving).square_() @ kernels - gap.square()).clamp(min=0)
+    variance = (moving.square_() @ kernels - mean.square()).clamp(min=0)
+    anchor_variance = (kernels * (anchor[..., None] - anchor_mean).square()).sum(1)
+    covariance = (variance + anchor_variance[:, None] - difference) / 2
     if has_tight:
-        difference[..., TIGHT] += (mean[..., TIGHT] - anchor_mean[:, None, TIGHT]).square()
+        difference[..., TIGHT] += (gap[..., TIGHT] + level[:, None] - shift).square()
     scale = (variance + NOISE_VARIANCE) * (anchor_variance[:, None] + NOISE_VARIANCE)
     return torch.log(difference + NOISE_VARIANCE), covariance / scale.sqrt(), torch.log(anchor_variance + 1)
 
@@ -159,12 +165,16 @@ def compare_windows(
 def lowest_place(log_ssd: Tensor) -> Tensor:
     """(m, K) places from the middle one to the lowest of (m, D, K), by the parabola of the SSD around it.
 
+    Of places whose SSDs differ by less than a thousandth the one nearest to the middle counts, of two such the first.
+
     >>> lowest_place(torch.tensor([9.0, 4.0, 1.0, 1.0, 4.0]).log()[None, :, None])
     tensor([[0.5000]])
     """
     ssd = log_ssd.exp()
     num_places = ssd.shape[1]
-    k = ssd.argmin(1, keepdim=True).clamp(1, num_places - 2)
+    away = (torch.arange(num_places, device=ssd.device) - num_places // 2).abs()[:, None].expand_as(ssd)
+    least = ssd.amin(1, keepdim=True)
+    k = away.masked_fill(ssd > least * (1 + TIE), num_places).argmin(1, keepdim=True).clamp(1, num_places - 2)
     return k[:, 0] - num_places // 2 + parabola_offset(ssd, k).clamp(-1, 1)
 
 
@@ -175,7 +185,7 @@ def parabola_offset(ssd: Tensor, k: Tensor) -> Tensor:
     tensor([0.5000])
     """
     before, least, after = (ssd.gather(1, k + step)[:, 0] for step in (-1, 0, 1))
-    bend = (before - 2 * least + after).clamp(min=1e-3)
+    bend = torch.maximum(before - 2 * least + after, _LEAST_BEND * least)
     return (before - after) / (2 * bend)
 
 

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <memory>
 
+#include "dispatch.hpp"
 #include "lanes.hpp"
 #include "tensor_stereo/parallel.hpp"
 #include "window_comparison.hpp"
@@ -25,6 +26,8 @@ constexpr float kAlone = 100;           // px, of a rival that there is not
 constexpr float kFarPlace = 1e4f;        // from the first disparity; what lies beyond is told by 5 at most
 constexpr std::int64_t kMatchesAtOnce = 16;
 constexpr Window kCurves[kEvidenceCurves] = {kLike, kTight}, kSlanted[kSlantedWindows] = {kMiddle, kLike};
+
+static_assert(kMaxSearched == kMaxPlaces);
 
 // What a thread works with.
 struct Workspace {
@@ -240,7 +243,7 @@ TENSOR_STEREO_INLINE void measure(const EvidencePair& pair, const EvidenceMatche
     const Place points[2] = {{matches.left[2 * m], matches.left[2 * m + 1]},
                              {matches.right[2 * m], matches.right[2 * m + 1]}};
     const Look looks[2] = {{pair.view[0], pair.is_rectified, along}, {pair.view[1], pair.is_rectified, along}};
-    const float disparity = matches.disparity[m], slope_x = matches.slope[2 * m], slope_y = matches.slope[2 * m + 1];
+    const float disparity = bounded(matches.disparity[m]), slope_x = matches.slope[2 * m], slope_y = matches.slope[2 * m + 1];
     const auto count = static_cast<int>(pair.count);
     const float start = pair.has_rows ? static_cast<float>(pair.first) : std::nearbyint(disparity) - kDisc;
     const float own = std::clamp(std::nearbyint(disparity - start), -kFarPlace, kFarPlace);
@@ -273,67 +276,31 @@ struct Job {
     const Evidence& result;
 };
 
-template <int N>
-TENSOR_STEREO_INLINE void measure_range(const Job& job, std::int64_t begin, std::int64_t end, Workspace& work) {
-    const std::int64_t* const ptr = job.matches.ptr;
-    std::int64_t b = std::upper_bound(ptr, ptr + job.num_pairs + 1, begin) - ptr - 1;
-    for (std::int64_t m = begin; m < end; ++m) {
-        while (m >= ptr[b + 1]) ++b;
-        measure<N>(job.pairs[b], job.matches, m, work, job.result);
+// The matches from begin to end.
+struct Range {
+    const Job& job;
+    std::int64_t begin, end;
+    Workspace& work;
+
+    template <int N>
+    TENSOR_STEREO_INLINE void run() const {
+        const std::int64_t* const ptr = job.matches.ptr;
+        std::int64_t b = std::upper_bound(ptr, ptr + job.num_pairs + 1, begin) - ptr - 1;
+        for (std::int64_t m = begin; m < end; ++m) {
+            while (m >= ptr[b + 1]) ++b;
+            measure<N>(job.pairs[b], job.matches, m, work, job.result);
+        }
     }
-}
-
-void measure_baseline(const Job& job, std::int64_t begin, std::int64_t end, Workspace& work) {
-    measure_range<4>(job, begin, end, work);
-}
-
-#if defined(__x86_64__) && defined(__GNUC__)
-#define TENSOR_STEREO_X86 1
-__attribute__((target("avx2"))) void measure_avx2(const Job& job, std::int64_t begin, std::int64_t end,
-                                                  Workspace& work) {
-    measure_range<8>(job, begin, end, work);
-}
-
-__attribute__((target("avx2,avx512f,avx512vl,avx512dq,avx512bw,prefer-vector-width=512"))) void measure_avx512(
-    const Job& job, std::int64_t begin, std::int64_t end, Workspace& work) {
-    measure_range<16>(job, begin, end, work);
-}
-#endif
-
-using Measure = void (*)(const Job&, std::int64_t, std::int64_t, Workspace&);
-
-Measure choose(Vectors vectors) {
-#ifdef TENSOR_STEREO_X86
-    if (vectors == Vectors::kBest) {
-        if (has_vectors(Vectors::kAvx512)) return measure_avx512;
-        if (has_vectors(Vectors::kAvx2)) return measure_avx2;
-    }
-    if (vectors == Vectors::kAvx512 && has_vectors(vectors)) return measure_avx512;
-    if (vectors == Vectors::kAvx2 && has_vectors(vectors)) return measure_avx2;
-#endif
-    return measure_baseline;
-}
+};
 
 }  // namespace
 
-bool has_vectors(Vectors vectors) {
-#ifdef TENSOR_STEREO_X86
-    if (vectors == Vectors::kAvx2) return __builtin_cpu_supports("avx2");
-    if (vectors == Vectors::kAvx512) {
-        return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
-               __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw");
-    }
-#endif
-    return vectors == Vectors::kBest || vectors == Vectors::kBaseline;
-}
-
 void window_evidence(const EvidencePair* pairs, std::int64_t num_pairs, const EvidenceMatches& matches,
                      int num_threads, const Evidence& result, Vectors vectors) {
-    const Measure run = choose(vectors);
     const Job job{pairs, num_pairs, matches, result};
     parallel_for(matches.ptr[num_pairs], kMatchesAtOnce, num_threads, [&] {
-        return [&, work = std::make_unique<Workspace>()](std::int64_t begin, std::int64_t end) {
-            run(job, begin, end, *work);
+        return [&, work = std::make_unique<Workspace>()](std::int64_t begin, std::int64_t end) mutable {
+            run_with(vectors, Range{job, begin, end, *work});
         };
     });
 }

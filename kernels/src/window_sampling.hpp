@@ -6,12 +6,12 @@
 #include <cstdint>
 
 #include "lanes.hpp"
-#include "tensor_stereo/window_evidence.hpp"
+#include "tensor_stereo/gray_image.hpp"
 
 namespace tensor_stereo {
 
 constexpr int kSide = 2 * kWindowRadius + 1;
-constexpr int kMaxPlaces = static_cast<int>(kMaxSearched);
+constexpr int kMaxPlaces = 256;  // of one strip
 constexpr int kStride = ((kMaxPlaces + kSide + kMaxLanes - 1) / kMaxLanes + 1) * kMaxLanes;
 
 // kSide rows of grey levels; columns behind `width` are finite.

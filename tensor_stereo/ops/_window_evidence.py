@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops.backends import native
-from tensor_stereo.ops.reference_evidence import NUM_CURVES, NUM_VALUES, Sought, Views
+from tensor_stereo.ops.reference_evidence import NUM_CURVES, NUM_VALUES, Sought
 from tensor_stereo.ops.reference_evidence import window_evidence as reference
 from tensor_stereo.ops.registration import operator
+from tensor_stereo.ops.samplers import Views
 
 
 def _fake(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -74,10 +75,7 @@ def window_evidence(
         places = Sought(left, right, along, disparity, across, slope)
         return reference(views, places, ptr, first, count, has_rows, rectified, width)
     values, curve0, curve1, start, offset = kernels.window_evidence(
-        [image.contiguous().numpy(force=True) for image in images0],
-        [image.contiguous().numpy(force=True) for image in images1],
-        [known.contiguous().numpy(force=True) for known in known1],
-        *(given.float().contiguous().numpy(force=True) for given in (origin, brighter)),
+        *Views(images0, images1, known1, origin, brighter).to_numpy(),
         *(given.float().contiguous().numpy(force=True) for given in (left, right, along, disparity, across, slope)),
         *(given.numpy(force=True) for given in (ptr, first, count, has_rows, rectified)),
         width,

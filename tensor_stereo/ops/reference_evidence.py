@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tensor_stereo.ops.samplers import LineSampler, RowSampler, Sampler, search_line
+from tensor_stereo.ops.samplers import Sampler, Views, search_line
 from tensor_stereo.ops.windows import (
     LIKE,
     MIDDLE,
@@ -51,25 +51,6 @@ class Sought(NamedTuple):
     def select(self, rows: slice) -> Sought:
         """Those of some matches."""
         return Sought(*(values[rows] for values in self))
-
-
-class Views(NamedTuple):
-    """The images of B pairs; see :class:`tensor_stereo.scores.samplers.PairViews`."""
-
-    images0: Sequence[Tensor]
-    images1: Sequence[Tensor]
-    known1: Sequence[Tensor]  # empty where a pair is rectified
-    origin: Tensor  # (B, 2)
-    brighter: Tensor  # (B,)
-
-    def look(self, b: int, along: Tensor, *, rectified: bool) -> tuple[Sampler, Sampler]:
-        """How both views of a pair are looked at."""
-        image0, image1 = self.images0[b].float(), self.images1[b].float() - self.brighter[b]
-        if rectified:
-            return RowSampler(image0), RowSampler(image1)
-        known0 = torch.ones_like(image0, dtype=torch.bool)
-        none = torch.zeros_like(self.origin[b])
-        return LineSampler(image0, none, along, known0), LineSampler(image1, self.origin[b], along, self.known1[b])
 
 
 def window_evidence(

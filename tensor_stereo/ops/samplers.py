@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -118,3 +119,27 @@ def search_line(
     begin = look.place(points, -(first + max(count - 1, 0)) if reverse else first, across)
     before = look.place(begin, torch.full_like(first, -RADIUS_PX), torch.zeros_like(across))
     return look.strips(before, count + 2 * RADIUS_PX), look.outside(begin, count)
+
+
+class Views(NamedTuple):
+    """The images of B pairs; see :class:`tensor_stereo.scores.samplers.PairViews`."""
+
+    images0: Sequence[Tensor]
+    images1: Sequence[Tensor]
+    known1: Sequence[Tensor]  # empty where a pair is rectified
+    origin: Tensor  # (B, 2)
+    brighter: Tensor  # (B,)
+
+    def to_numpy(self) -> tuple[Any, ...]:
+        """The same for the kernels."""
+        images = ([image.contiguous().numpy(force=True) for image in part] for part in self[:3])
+        return *images, *(values.float().contiguous().numpy(force=True) for values in self[3:])
+
+    def look(self, b: int, along: Tensor, *, rectified: bool) -> tuple[Sampler, Sampler]:
+        """How both views of a pair are looked at."""
+        image0, image1 = self.images0[b].float(), self.images1[b].float() - self.brighter[b]
+        if rectified:
+            return RowSampler(image0), RowSampler(image1)
+        known0 = torch.ones_like(image0, dtype=torch.bool)
+        none = torch.zeros_like(self.origin[b])
+        return LineSampler(image0, none, along, known0), LineSampler(image1, self.origin[b], along, self.known1[b])

@@ -103,8 +103,8 @@ def sample_frames(image: Tensor, origins: Tensor, axes: Tensor, offsets: Tensor)
 def window_kernels(windows: Tensor) -> Tensor:
     """(m, 225, 8) weights with sum 1 of the pixels of m windows.
 
-    5 x 5 and 11 x 11 boxes; pixels like the 3 x 3 px in the middle (Yoon & Kweon 2006); of 11 x 11 those near the middle
-    and like it, which keep to one side of an edge; and the left, right, upper and lower half of 11 x 11.
+    5 x 5 and 11 x 11 boxes; pixels like the 3 x 3 px in the middle (Yoon & Kweon 2006); of 11 x 11 those near the
+    middle and like it, which keep to one side of an edge; and the left, right, upper and lower half of 11 x 11.
 
     >>> window_kernels(torch.rand(2, 15, 15)).sum(1)[0, :3]
     tensor([1.0000, 1.0000, 1.0000])

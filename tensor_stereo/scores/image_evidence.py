@@ -23,7 +23,7 @@ from tensor_stereo.graphs import MatchGraphs, check_match_graphs
 from tensor_stereo.ops._window_evidence import window_evidence
 from tensor_stereo.ops.reference_evidence import DISC_PX, NEAR_PX, NUM_CURVES, NUM_VALUES
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, no_alignment
-from tensor_stereo.scores.samplers import find_places, prepare_views
+from tensor_stereo.scores.samplers import find_places, list_views, prepare_views
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.types import Matches
 
@@ -117,14 +117,9 @@ def measure_images(
     device = matches.ptr.device
     first, counts = torch.tensor(ranges, dtype=torch.int64, device=device).reshape(-1, 2).unbind(1)
     pairs = list(prepare_views(views, matches, alignment))
-    nothing = torch.zeros(0, 0, dtype=torch.bool, device=device)
     with torch.autocast(device.type, enabled=False):
         values, curve0, curve1, start, offset = window_evidence(
-            [pair.image0 for pair in pairs],
-            [pair.image1 for pair in pairs],
-            [nothing if pair.known1 is None else pair.known1 for pair in pairs],
-            torch.stack([pair.origin for pair in pairs]) if pairs else torch.zeros(0, 2, device=device),
-            torch.tensor([pair.brighter for pair in pairs], dtype=torch.float32, device=device),
+            *list_views(pairs, device),
             *places,
             matches.ptr,
             first,

@@ -14,30 +14,21 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.batching import batch_to_ptr, ptr_to_batch, select_matches
+from tensor_stereo.configs import Backend
 from tensor_stereo.delaunay.one_to_one import coincident_ids, first_of_coincident
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import build_match_graphs
-from tensor_stereo.ops.samplers import Sampler, search_line
+from tensor_stereo.ops._window_search import window_search
 from tensor_stereo.ops.segments import to_points
-from tensor_stereo.ops.windows import (
-    LIKE,
-    NUM_WHOLE,
-    RADIUS_PX,
-    TIGHT,
-    compare_windows,
-    parabola_offset,
-    window_kernels,
-)
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, map_points, no_alignment
 from tensor_stereo.scores.image_evidence import MAX_DISPARITIES
-from tensor_stereo.scores.samplers import Place, find_places, look_at_pairs
+from tensor_stereo.scores.samplers import find_places, list_views, prepare_views
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.types import Matches, check_mask, check_points, check_ptr, check_vector
 
 _LEAST_KEPT = 4  # matches of a pair that predict for others
 _NUM_NEIGHBORS = 8
 _NEAR_PX = 3.0  # of a prediction
-_NOWHERE = 40.0  # log SSD of a place that is not looked at
 _ROWS_AT_ONCE = 192
 
 
@@ -79,6 +70,7 @@ def repair_matches(
     *,
     keypoints0: Tensor | None = None,
     ptr0: Tensor | None = None,
+    backend: Backend = "auto",
 ) -> RepairedMatches:
     """Give rejected matches, and keypoints without a partner, the partner that kept neighbours and images favour.
 
@@ -90,6 +82,7 @@ def repair_matches(
         alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
         keypoints0: (N, 2) px, keypoints of view 0; those that a match of their pair has already are left out.
         ptr0: (B + 1,) int64 offsets of ``keypoints0``; None for one pair.
+        backend: A name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         The matches. Pairs with fewer than four kept ones stay as they are. A pair does not depend on the others. No
@@ -115,7 +108,7 @@ def repair_matches(
     if alignment is None:
         alignment = no_alignment(matches.num_pairs, matches.keypoints0)
     targets = _collect_targets(matches, kept, *_list_keypoints(matches, keypoints0, ptr0))
-    partners, found = _search(views, matches, kept, targets, alignment)
+    partners, found = _search(views, matches, kept, targets, alignment, backend)
     return _join(matches, targets, partners, found)
 
 
@@ -164,7 +157,12 @@ def _by_pair(pairs: Tensor, num_pairs: int) -> tuple[Tensor, Tensor]:
 
 
 def _search(
-    views: Sequence[Sequence[Tensor]], matches: Matches, kept: Tensor, targets: _Targets, alignment: Alignment
+    views: Sequence[Sequence[Tensor]],
+    matches: Matches,
+    kept: Tensor,
+    targets: _Targets,
+    alignment: Alignment,
+    backend: Backend,
 ) -> tuple[Tensor, Tensor]:
     """(T, 2) partners of the targets, and (T,) whether one was found."""
     known = select_matches(matches, kept)
@@ -180,24 +178,29 @@ def _search(
     of_known = Matches(aligned.keypoints0[is_known], aligned.keypoints1[is_known], known.ptr)
     slope = estimate_slopes(of_known, build_match_graphs(known)).double()
     disparity = of_known.keypoints0[:, 0] - of_known.keypoints1[:, 0]
-    partners, found = there.clone(), torch.zeros(len(there), dtype=torch.bool, device=there.device)
-    offsets, starts = known.ptr.tolist(), targets.ptr.tolist()
+    offsets, starts, bounds = known.ptr.tolist(), targets.ptr.tolist(), both.ptr.tolist()
+    predicted, ranges = [targets.points.new_zeros(0, _NUM_NEIGHBORS)], []
+    for b in range(matches.num_pairs):
+        mine, count = slice(offsets[b], offsets[b + 1]), offsets[b + 1] - offsets[b]
+        seats = aligned.keypoints0[bounds[b] : bounds[b + 1]]
+        if count < _LEAST_KEPT or starts[b] == starts[b + 1]:
+            predicted.append(seats.new_full((starts[b + 1] - starts[b], _NUM_NEIGHBORS), torch.nan))
+            ranges.append((0, 3))
+            continue
+        predicted.append(_predict(seats[count:], seats[:count], disparity[mine], slope[mine]))
+        ranges.append(_range(predicted[-1], disparity[mine]))
+    first, counts = torch.tensor(ranges, dtype=torch.int64, device=there.device).reshape(-1, 2).unbind(1)
+    own = places.select(~is_known)
+    pairs = list(prepare_views(views, both, alignment))
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
-        for b, (looks, own) in enumerate(look_at_pairs(views, both, places, alignment)):
-            mine, whole = slice(offsets[b], offsets[b + 1]), slice(starts[b], starts[b + 1])
-            count = offsets[b + 1] - offsets[b]
-            if count < _LEAST_KEPT or whole.start == whole.stop:
-                continue
-            seats = aligned.keypoints0[both.ptr[b] : both.ptr[b + 1]]
-            predicted = _predict(seats[count:], seats[:count], disparity[mine], slope[mine])
-            first, width = _range(predicted, disparity[mine])
-            for rows in torch.arange(len(predicted), device=seats.device).split(_ROWS_AT_ONCE):  # type: ignore[no-untyped-call]
-                seen, place = [look.select(count + rows) for look in looks], own.select(count + rows)
-                best, is_inside = _best_disparity(seen, place, predicted[rows].float(), first, width)
-                moved = seen[1].place(place.left, -best, place.across).double()
-                partners[whole.start + rows] = map_points(back, moved, torch.full_like(rows, b))
-                found[whole.start + rows] = is_inside
-    return partners, found
+        best, found = window_search(
+            *list_views(pairs, there.device), own.left, own.along, own.across, torch.cat(predicted).float(),
+            targets.ptr, first, counts, alignment.rectified, _NEAR_PX, backend,
+        )  # fmt: skip
+    x, y = own.along.unbind(1)
+    line = torch.stack([-y, x], 1)
+    moved = (own.left - best[:, None] * own.along + own.across[:, None] * line).double()
+    return map_points(back, moved, ptr_to_batch(targets.ptr)), found
 
 
 def _predict(points: Tensor, known: Tensor, disparity: Tensor, slope: Tensor) -> Tensor:
@@ -208,6 +211,7 @@ def _predict(points: Tensor, known: Tensor, disparity: Tensor, slope: Tensor) ->
         for part in points.split(_ROWS_AT_ONCE)  # type: ignore[no-untyped-call]
     ]
     near = torch.cat(parts)
+    near = torch.cat([near, near[:, -1:].expand(-1, _NUM_NEIGHBORS - count)], 1)  # all pairs have as many
     way = points[:, None] - known[near]
     in_view0 = slope / (1 + slope[:, :1] / 2)  # from the cyclopean frame
     return disparity[near] + (in_view0[near] * way).sum(2)
@@ -221,23 +225,6 @@ def _range(predicted: Tensor, disparity: Tensor) -> tuple[int, int]:
     high = min(high, middle + MAX_DISPARITIES)
     first = int(low // 1)
     return first, max(int(high // 1) + 2 - first, 3)
-
-
-def _best_disparity(
-    looks: Sequence[Sampler], places: Place, predicted: Tensor, first: int, count: int
-) -> tuple[Tensor, Tensor]:
-    """(m,) px to a fraction, and whether a place near a prediction lies inside of view 1."""
-    windows = looks[0].windows(places.left, RADIUS_PX)
-    kernels = window_kernels(windows)[..., :NUM_WHOLE]
-    lowest = torch.full_like(places.across, first)
-    strips, outside = search_line(looks[1], places.left, places.across, lowest, count, reverse=True)
-    cost, _, _ = compare_windows(windows, strips, kernels, has_tight=True)
-    cost = cost.flip(1)[..., [LIKE, TIGHT]].mean(2)
-    disparity = first + torch.arange(count, device=cost.device, dtype=cost.dtype)
-    near = ((disparity[:, None] - predicted[:, None]).abs() <= _NEAR_PX).any(2)
-    allowed = near & ~outside.flip(1)
-    k = cost.masked_fill(~allowed, _NOWHERE).argmin(1, keepdim=True).clamp(1, count - 2)
-    return disparity[k[:, 0]] + parabola_offset(cost.exp(), k).clamp(-0.5, 0.5), allowed.any(1)
 
 
 def _join(matches: Matches, targets: _Targets, partners: Tensor, found: Tensor) -> RepairedMatches:

@@ -122,6 +122,20 @@ def prepare_views(views: Sequence[Sequence[Tensor]], matches: Matches, alignment
         yield PairViews(warped.image0, warped.image1, brighter, warped.origin, warped.known1)
 
 
+def list_views(
+    pairs: Sequence[PairViews], device: torch.device
+) -> tuple[list[Tensor], list[Tensor], list[Tensor], Tensor, Tensor]:
+    """The views of B pairs as the operators on windows take them."""
+    nothing = torch.zeros(0, 0, dtype=torch.bool, device=device)
+    return (
+        [pair.image0 for pair in pairs],
+        [pair.image1 for pair in pairs],
+        [nothing if pair.known1 is None else pair.known1 for pair in pairs],
+        torch.stack([pair.origin for pair in pairs]) if pairs else torch.zeros(0, 2, device=device),
+        torch.tensor([pair.brighter for pair in pairs], dtype=torch.float32, device=device),
+    )
+
+
 def look_at_pairs(
     views: Sequence[Sequence[Tensor]], matches: Matches, places: Place, alignment: Alignment
 ) -> Iterator[tuple[tuple[Sampler, Sampler], Place]]:

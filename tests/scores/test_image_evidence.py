@@ -20,7 +20,7 @@ from tests.oracles import neighbor_sets
 from tests.scores.evidence_oracle import brightness, measure_match, search_range, slope_at
 from tests.scores.learned_oracle import random_pairs
 
-# Grey levels count from the pixel in the middle of each window. Where the others lie 100 levels away, squares reach 1e4,
+# Grey levels count from the pixel in the middle of each window. Where others lie 100 levels away, squares reach 1e4,
 # whose weighted sums float32 keeps to about sqrt(225) * 2^-24 * 1e4 / 15 = 6e-4 squared levels; the logarithm of the
 # difference is taken from 2 squared levels on: 3e-4, or twice that for a difference of two logarithms.
 ATOL = 6e-4

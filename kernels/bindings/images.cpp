@@ -8,6 +8,7 @@
 
 #include "bindings.hpp"
 #include "tensor_stereo/window_evidence.hpp"
+#include "tensor_stereo/window_refine.hpp"
 #include "tensor_stereo/window_search.hpp"
 
 namespace bindings {
@@ -137,6 +138,36 @@ auto window_search(const Images& images0, const Images& images1, const Images& k
     return std::tuple(give(std::move(disparity), num_keypoints), give(std::move(found), num_keypoints));
 }
 
+auto window_refine(const Images& images0, const Images& images1, const Images& known1, FloatPoints origin,
+                   Floats brighter, FloatPoints left, FloatPoints right, FloatPoints along, Floats off_line,
+                   FloatPoints slope, Integers ptr, Flags rectified, float max_shift, int num_threads, int vectors) {
+    const std::size_t num_pairs = images0.size(), num_matches = left.shape(0);
+    check(images1.size() == num_pairs && known1.size() == num_pairs && origin.shape(0) == num_pairs &&
+              brighter.shape(0) == num_pairs && rectified.shape(0) == num_pairs && ptr.shape(0) == num_pairs + 1,
+          "what is given for pairs must have one entry per pair");
+    check(right.shape(0) == num_matches && along.shape(0) == num_matches && off_line.shape(0) == num_matches &&
+              slope.shape(0) == num_matches,
+          "what is given for matches must have one entry per match");
+    check_offsets(ptr, static_cast<std::int64_t>(num_matches), "ptr must rise from 0 to the number of matches");
+    check_vectors(vectors);
+    std::vector<ts::RefinePair> pairs(num_pairs);
+    for (std::size_t b = 0; b < num_pairs; ++b) {
+        set_views(pairs[b].view, b, images0, images1, known1, origin, brighter, rectified(b));
+        pairs[b].is_rectified = rectified(b);
+    }
+    auto shift = ts::allocate<float>(num_matches), across = ts::allocate<float>(num_matches),
+         variance = ts::allocate<float>(num_matches);
+    {
+        const nb::gil_scoped_release release;
+        ts::window_refine(pairs.data(), static_cast<std::int64_t>(num_pairs),
+                          {ptr.data(), left.data(), right.data(), along.data(), off_line.data(), slope.data()},
+                          max_shift, num_threads, {shift.get(), across.get(), variance.get()},
+                          static_cast<ts::Vectors>(vectors));
+    }
+    return std::tuple(give(std::move(shift), num_matches), give(std::move(across), num_matches),
+                      give(std::move(variance), num_matches));
+}
+
 }  // namespace
 
 void bind_images(nb::module_& module) {
@@ -149,6 +180,10 @@ void bind_images(nb::module_& module) {
                nb::arg("origin"), nb::arg("brighter"), nb::arg("points"), nb::arg("along"), nb::arg("across"),
                nb::arg("predicted"), nb::arg("ptr"), nb::arg("first"), nb::arg("count"), nb::arg("rectified"),
                nb::arg("near_px"), nb::arg("num_threads"), nb::arg("vectors") = 0);
+    module.def("window_refine", &window_refine, nb::arg("images0"), nb::arg("images1"), nb::arg("known1"),
+               nb::arg("origin"), nb::arg("brighter"), nb::arg("left"), nb::arg("right"), nb::arg("along"),
+               nb::arg("off_line"), nb::arg("slope"), nb::arg("ptr"), nb::arg("rectified"), nb::arg("max_shift"),
+               nb::arg("num_threads"), nb::arg("vectors") = 0);
 }
 
 }  // namespace bindings

@@ -12,26 +12,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from tensor_stereo.batching import ptr_to_batch
+from tensor_stereo.batching import ptr_to_batch, select_matches
+from tensor_stereo.configs import Backend
 from tensor_stereo.features import list_images
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs, check_match_graphs
-from tensor_stereo.ops.samplers import Sampler
-from tensor_stereo.ops.windows import NOISE_VARIANCE, RADIUS_PX, TIGHT, window_kernels
+from tensor_stereo.ops._window_refine import window_refine
 from tensor_stereo.scores.alignment.form import Alignment, align_matches, epipolar_frames, map_points, no_alignment
 from tensor_stereo.scores.repair import Origin
-from tensor_stereo.scores.samplers import Place, blur, find_places, look_at_pairs
+from tensor_stereo.scores.samplers import blur, find_places, list_views, prepare_views
 from tensor_stereo.scores.slopes import estimate_slopes
 from tensor_stereo.types import Matches, check_mask, check_vector
 
 _BLUR = 1.4  # as in so many times fewer pixels; interpolation then smooths all places alike, which locks no pixel
-_STEPS = 4
-_STEP_PX = 0.5  # the longest
-_APART_PX = 0.25  # of the samples that give the slope of the grey levels
-_DAMPING = 1.0  # grey levels squared per px squared; flat windows stay
-_NUM_PIXELS = 40.0  # that tell independently, of a window
 _DISTRUST = 16.0  # times the variance that noise alone would give a minimum
 _PRIOR_PX, _PRIOR_SLOPE, _PRIOR_REACH_PX, _PRIOR_MISS_PX = 0.1, 0.01, 25.0, 0.5
-_ROWS_AT_ONCE = 512
 
 
 def refine_matches(
@@ -43,6 +37,7 @@ def refine_matches(
     graphs: MatchGraphs | None = None,
     *,
     max_shift_px: float = 1.0,
+    backend: Backend = "auto",
 ) -> Matches:
     """Move the keypoints of view 1 of kept matches to where the windows of both views fit best.
 
@@ -56,6 +51,7 @@ def refine_matches(
         alignment: What the matches of every pair share; None: rectified pairs with the same rows in both views.
         graphs: The graphs of the same matches; None: they are built.
         max_shift_px: No keypoint moves farther, in px of view 0.
+        backend: A name of :mod:`tensor_stereo.ops.backends`.
 
     Returns:
         The same matches, some of them elsewhere in view 1, never where their windows fit worse. A pair does not depend
@@ -87,7 +83,7 @@ def refine_matches(
     if alignment is None:
         alignment = no_alignment(matches.num_pairs, matches.keypoints0)
     with torch.no_grad():
-        along, across = _find_shifts(views, matches, graphs, kept, alignment, max_shift_px)
+        along, across = _find_shifts(views, matches, graphs, kept, alignment, max_shift_px, backend)
         frames = epipolar_frames(matches, alignment)
         x, y = torch.where(_is_rectified(matches, alignment), frames.along.new_tensor([1.0, 0.0]), frames.along).unbind(
             1
@@ -111,56 +107,27 @@ def _find_shifts(
     kept: Tensor,
     alignment: Alignment,
     max_shift_px: float,
+    backend: Backend,
 ) -> tuple[Tensor, Tensor]:
     """(M,) px of view 0 along and across the lines, 0 where a match stays."""
     aligned = align_matches(matches, alignment)
     places = find_places(matches, aligned, estimate_slopes(aligned, graphs), alignment)
-    found = [torch.zeros(matches.num_matches, device=matches.ptr.device) for _ in range(3)]
-    offsets = matches.ptr.tolist()
+    rows = kept.nonzero()[:, 0]
+    own = places.select(rows)
+    pairs = [
+        pair._replace(image0=blur(pair.image0.float(), _BLUR), image1=blur(pair.image1.float(), _BLUR))
+        for pair in prepare_views(views, matches, alignment)
+    ]
     with torch.autocast(matches.keypoints0.device.type, enabled=False):
-        for b, (sharp, own) in enumerate(look_at_pairs(views, matches, places, alignment)):
-            samplers = [sampler._replace(image=blur(sampler.image, _BLUR)) for sampler in sharp]
-            for rows in kept[offsets[b] : offsets[b + 1]].nonzero()[:, 0].split(_ROWS_AT_ONCE):  # type: ignore[no-untyped-call]
-                looks = [sampler.select(rows) for sampler in samplers]
-                for whole, part in zip(found, _minimise(looks, own.select(rows), max_shift_px), strict=True):
-                    whole[offsets[b] + rows] = part
-    along, across, variance = found
+        moved = window_refine(
+            *list_views(pairs, matches.ptr.device), own.left, own.right, own.along, own.off_line, own.slope,
+            select_matches(matches, kept).ptr, alignment.rectified, max_shift_px, backend,
+        )  # fmt: skip
+    still = torch.zeros(matches.num_matches, device=matches.ptr.device)
+    along, across, variance = (still.index_copy(0, rows, part) for part in moved)
     along = _trust_neighbors(aligned, graphs, kept, along, variance)
     limit = (max_shift_px**2 - across.square()).clamp(min=0).sqrt()
     return along.clamp(-limit, limit).double(), across.double()
-
-
-def _minimise(looks: Sequence[Sampler], places: Place, max_shift_px: float) -> tuple[Tensor, Tensor, Tensor]:
-    """(m,) shifts along and across the line, and the variance of the first."""
-    half = places.slope / 2
-    windows = looks[0].slanted(places.left, RADIUS_PX, half)
-    kernel = window_kernels(windows)[..., TIGHT].reshape_as(windows)
-
-    def differ(along: Tensor, across: Tensor) -> Tensor:
-        other = looks[1].slanted(looks[1].place(places.right, along, across), RADIUS_PX, -half)
-        return _centered(windows - other, kernel)
-
-    def cost(along: Tensor, across: Tensor) -> Tensor:
-        return (kernel * differ(along, across).square()).sum((1, 2))
-
-    still = torch.zeros_like(places.across)
-    across = torch.where(places.off_line.abs() <= max_shift_px, -places.off_line, 0)
-    limit = (max_shift_px**2 - across.square()).clamp(min=0).sqrt()
-    along, bend = still, still
-    for _ in range(_STEPS):
-        ahead, back = (differ(along + step, across) for step in (_APART_PX, -_APART_PX))
-        slope = (back - ahead) / (2 * _APART_PX)
-        bend = (kernel * slope.square()).sum((1, 2))
-        step = (kernel * slope * differ(along, across)).sum((1, 2)) / (bend + _DAMPING)
-        along = (along + step.clamp(-_STEP_PX, _STEP_PX)).clamp(-limit, limit)
-    before, after = cost(still, still), cost(along, across)
-    better = after <= before
-    variance = (after + NOISE_VARIANCE) / (bend + 1e-3) / _NUM_PIXELS
-    return torch.where(better, along, 0), torch.where(better, across, 0), variance
-
-
-def _centered(windows: Tensor, kernel: Tensor) -> Tensor:
-    return windows - (kernel * windows).sum((1, 2), keepdim=True)
 
 
 def _trust_neighbors(aligned: Matches, graphs: MatchGraphs, kept: Tensor, along: Tensor, variance: Tensor) -> Tensor:

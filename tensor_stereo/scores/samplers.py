@@ -242,6 +242,13 @@ def blur(image: Tensor, px_per_px: float) -> Tensor:
         return image
     offsets = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
     kernel = torch.exp(-(offsets / sigma).square() / 2)
-    kernel = (kernel / kernel.sum())[None, None, None]
-    padded = functional.pad(image[None, None], (radius,) * 4, mode="reflect")
-    return functional.conv2d(functional.conv2d(padded, kernel), kernel.transpose(2, 3))[0, 0]
+    weights = (kernel / kernel.sum()).tolist()
+    padded = functional.pad(image[None, None], (radius,) * 4, mode="reflect")[0, 0]
+    for axis in (1, 0):  # sums of shifted images; a convolution of one channel takes ten times as long
+        size = padded.shape[axis] - 2 * radius
+        shifted = (padded.narrow(axis, k, size) for k in range(len(weights)))
+        total = next(shifted) * weights[0]
+        for part, weight in zip(shifted, weights[1:], strict=True):
+            total.add_(part, alpha=weight)
+        padded = total
+    return padded

@@ -69,8 +69,8 @@ def test_bits_depend_on_no_instructions_and_no_threads(monkeypatch: pytest.Monke
     for vectors in range(4):
         try:
             runs.append(kernels.window_evidence(*seen[0], 1 + vectors % 2, vectors))  # type: ignore[union-attr]
-        except ValueError as error:
-            assert "instructions" in str(error) and vectors >= 2  # noqa: PT018  # this machine lacks them
+        except ValueError:  # this machine lacks them
+            assert vectors >= 2
     assert len(runs) >= 2
     for run in runs:
         for one, other in zip(run, first, strict=True):

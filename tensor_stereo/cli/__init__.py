@@ -16,6 +16,7 @@ from tensor_stereo.cli.checks import check
 from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
 from tensor_stereo.cli.endings import BAD_INPUT, INTERRUPTED, fail
 from tensor_stereo.cli.flags import name_flags
+from tensor_stereo.waiting import wait_passively
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -34,7 +35,11 @@ _IN_ONE_LINE = ("DomainWarning", "SampleRangeWarning")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; bad input ends in one line on standard error and exit code 2."""
+    """Run the command line; bad input ends in one line on standard error and exit code 2.
+
+    Threads of torch wait without spinning, unless the user has set ``OMP_WAIT_POLICY``.
+    """
+    wait_passively()
     if list(sys.argv[1:] if arguments is None else arguments) == ["--version"]:
         from tensor_stereo import __version__
 

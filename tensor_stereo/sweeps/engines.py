@@ -19,6 +19,7 @@ from tensor_stereo.configs import SweepConfig
 from tensor_stereo.sweeps.journal import SweepError
 from tensor_stereo.sweeps.plan import Task
 from tensor_stereo.sweeps.units import UnitResult, run_tasks
+from tensor_stereo.waiting import passive_children
 
 
 class Outcome(NamedTuple):
@@ -68,7 +69,7 @@ class LocalEngine:
 
     Workers are forked from a server that has imported the library and nothing else, so that they start at once and no
     thread is lost in a fork; where there is no such server they are started anew. They leave signals to their parent,
-    and end with it.
+    and end with it. Their threads wait without spinning.
 
     Args:
         config: the points of the sweep.
@@ -119,7 +120,8 @@ class LocalEngine:
     def _start_worker(self) -> None:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._config), daemon=True)
-        process.start()
+        with passive_children():
+            process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
         self._workers[ours] = _Worker(process)
 

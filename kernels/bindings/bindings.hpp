@@ -29,6 +29,7 @@ void bind_graphs(nb::module_& module);
 void bind_soft(nb::module_& module);
 void bind_matches(nb::module_& module);
 void bind_images(nb::module_& module);
+void bind_learned(nb::module_& module);
 
 // What frees an array that NumPy holds.
 nb::capsule owner_of(void* data);

@@ -6,4 +6,5 @@ NB_MODULE(_kernels, module) {
     bindings::bind_soft(module);
     bindings::bind_matches(module);
     bindings::bind_images(module);
+    bindings::bind_learned(module);
 }

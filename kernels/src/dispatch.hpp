@@ -14,7 +14,7 @@ void run_baseline(const Body& body) {
 
 #if defined(__x86_64__) && defined(__GNUC__)
 template <class Body>
-__attribute__((target("avx2"))) void run_avx2(const Body& body) {
+__attribute__((target("avx2,fma"))) void run_avx2(const Body& body) {
     body.template run<8>();
 }
 

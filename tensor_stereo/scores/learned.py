@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +33,7 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
+from tensor_stereo.scores.learned_native import infer_natively
 from tensor_stereo.scores.planes import NUM_PLANE, NUM_REFINED_PLANE, plane_columns
 from tensor_stereo.scores.tolerance import NUM_TOLERANCES, probability_within, rising
 from tensor_stereo.types import Adjacency, Matches
@@ -79,6 +81,8 @@ class LearnedScore(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("calibration", torch.tensor([1.0, 0.0]).repeat(NUM_TOLERANCES, 1))
+        self.has_native_size = (width, edge_width, num_rounds) == (_WIDTH, _EDGE_WIDTH, _ROUNDS)
+        self.packed: tuple[Any, Tensor] | None = None  # by pack_weights
 
     def forward(
         self,
@@ -102,6 +106,12 @@ class LearnedScore(nn.Module):
             keypoints from all that is continuous in them, and are finite.
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
+            backend = "auto" if config is None else config.backend
+            found = None
+            if not torch.compiler.is_compiling():
+                found = infer_natively(self, matches, graphs, evidence, alignment, backend)
+            if found is not None:
+                return found, self.calibrate(found)
             logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config, alignment))
             return logit, self.calibrate(logit)
 

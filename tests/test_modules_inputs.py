@@ -195,12 +195,12 @@ def test_weights_of_learned_are_parameters_that_survive_and_can_be_trained() -> 
     optimizer.step()
     after = module(LEFT, RIGHT).score
     assert after.mean() < before.mean()
-    assert torch.equal(frozen(LEFT, RIGHT).score, before)  # every filter has weights of its own
+    assert torch.allclose(frozen(LEFT, RIGHT).score, before, atol=1e-6)  # every filter has weights of its own
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     file.seek(0)
     frozen.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(frozen(LEFT, RIGHT).score, after)
+    assert torch.allclose(frozen(LEFT, RIGHT).score, after, atol=1e-6)  # a kernel computes it without gradients
     from safetensors.torch import load, save
 
     frozen.load_state_dict(load(save(module.state_dict())))

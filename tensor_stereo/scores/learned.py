@@ -33,7 +33,7 @@ from tensor_stereo.scores.learned_inputs import (
     check_fit,
     measure_quantities,
 )
-from tensor_stereo.scores.learned_native import infer_natively
+from tensor_stereo.scores.learned_native import infer_natively, runs_natively
 from tensor_stereo.scores.planes import NUM_PLANE, NUM_REFINED_PLANE, plane_columns
 from tensor_stereo.scores.tolerance import NUM_TOLERANCES, probability_within, rising
 from tensor_stereo.types import Adjacency, Matches
@@ -42,7 +42,7 @@ WEIGHTS = {
     rectified: Path(__file__).with_name(f"weights_{name}.safetensors")
     for rectified, name in ((True, "rectified"), (False, "views"))
 }
-_MATCHES_AT_ONCE = 8192  # whose edges stay in the cache, and are enough for two threads
+_MATCHES_AT_ONCE = 8192  # of the torch network, whose edges stay in the cache, and are enough for two threads
 _WIDTH, _EDGE_WIDTH, _ROUNDS = 24, 12, 3
 _MAX_NORMALIZED = 4.0  # standard deviations
 
@@ -107,11 +107,9 @@ class LearnedScore(nn.Module):
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
             backend = "auto" if config is None else config.backend
-            found = None
-            if not torch.compiler.is_compiling():
-                found = infer_natively(self, matches, graphs, evidence, alignment, backend)
-            if found is not None:
-                return found, self.calibrate(found)
+            if runs_natively(self, matches, backend):
+                logit = infer_natively(self, matches, graphs, evidence, alignment)
+                return logit, self.calibrate(logit)
             logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config, alignment))
             return logit, self.calibrate(logit)
 
@@ -330,9 +328,13 @@ def learned_probabilities(
         return _score_compiled(matches, graphs, evidence, config, alignment, network)
     kinds = [True] * matches.num_pairs if alignment is None else alignment.rectified.tolist()
     parts = []
-    for (first, last), part, own, seen in _parts(matches, graphs, evidence, kinds):
+    networks = {kind: _of_kind(network, matches, rectified=kind) for kind in set(kinds)}
+    backend = "auto" if config is None else config.backend
+    is_native = all(runs_natively(one, matches, backend) for one in networks.values())
+    limit = matches.num_matches if is_native else _MATCHES_AT_ONCE
+    for (first, last), part, own, seen in _parts(matches, graphs, evidence, kinds, limit):
         shared = None if alignment is None else alignment.select(first, last)
-        parts.append(_of_kind(network, matches, rectified=kinds[first])(part, own, seen, config, shared)[1])
+        parts.append(networks[kinds[first]](part, own, seen, config, shared)[1])
     if not parts:
         return (matches.keypoints0 + matches.keypoints1).float()[:, :1].expand(-1, NUM_TOLERANCES)  # with a gradient
     return torch.cat(parts)
@@ -366,18 +368,14 @@ def _score_compiled(
 
 
 def _parts(
-    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None, kinds: Sequence[bool]
+    matches: Matches, graphs: MatchGraphs, evidence: ImageEvidence | None, kinds: Sequence[bool], limit: int
 ) -> Iterator[tuple[tuple[int, int], Matches, MatchGraphs, ImageEvidence | None]]:
-    """Runs of pairs of one kind whose matches number about :data:`_MATCHES_AT_ONCE`."""
+    """Runs of pairs of one kind with at most ``limit`` matches, or one pair."""
     offsets = matches.ptr.tolist()
     first = 0
     while first < matches.num_pairs:
         last = first + 1
-        while (
-            last < matches.num_pairs
-            and kinds[last] == kinds[first]
-            and offsets[last + 1] - offsets[first] <= _MATCHES_AT_ONCE
-        ):
+        while last < matches.num_pairs and kinds[last] == kinds[first] and offsets[last + 1] - offsets[first] <= limit:
             last += 1
         rows = slice(offsets[first], offsets[last])
         ptr = matches.ptr[first : last + 1] - rows.start

@@ -23,15 +23,29 @@ if TYPE_CHECKING:
 _SCALED = ("nodes", "cost", "image", "edges", "edge_image")
 
 
+def runs_natively(network: LearnedScore, matches: Matches, backend: Backend) -> bool:
+    """Whether the kernel computes that network for these matches: not where a gradient is asked for.
+
+    >>> from tensor_stereo.scores.learned import load_learned
+    >>> points = torch.rand(9, 2).requires_grad_()
+    >>> runs_natively(load_learned(), Matches(points, points, torch.tensor([0, 9])), "auto")
+    False
+    """
+    if torch.compiler.is_compiling() or native(backend) is None or not network.has_native_size:
+        return False
+    given = (matches.keypoints0, matches.keypoints1, *network.parameters())
+    wants_gradient = torch.is_grad_enabled() and any(values.requires_grad for values in given)
+    return not wants_gradient and all(values.is_cpu for values in given)
+
+
 def infer_natively(
     network: LearnedScore,
     matches: Matches,
     graphs: MatchGraphs,
     evidence: ImageEvidence | None,
     alignment: Alignment | None,
-    backend: Backend,
-) -> Tensor | None:
-    """(M, 5) float32 logits; None where a gradient is asked for, or no kernel computes that network.
+) -> Tensor:
+    """(M, 5) float32 logits, of what :func:`runs_natively`.
 
     Args:
         network: Of the size that the package has.
@@ -39,14 +53,10 @@ def infer_natively(
         graphs: The graphs of the same matches.
         evidence: What their images say, or None.
         alignment: What the matches of every pair share, or None.
-        backend: A name of :mod:`tensor_stereo.ops.backends`.
     """
-    kernels = native(backend)
-    given = (matches.keypoints0, matches.keypoints1, *network.parameters())
-    wants_gradient = torch.is_grad_enabled() and any(values.requires_grad for values in given)
-    on_cpu = all(values.is_cpu for values in given)
-    if kernels is None or wants_gradient or not on_cpu or not network.has_native_size:
-        return None
+    kernels = native("native")
+    if kernels is None:
+        raise ValueError("backend must be 'native'")
     has_rows = torch.ones(matches.num_pairs, dtype=torch.bool)
     cost = None if matches.cost is None else matches.cost.detach().double().contiguous().numpy()
     if alignment is not None:

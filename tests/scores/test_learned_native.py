@@ -14,7 +14,7 @@ from tensor_stereo.graphs import build_match_graphs
 from tensor_stereo.scores import LearnedScore, load_learned, measure_images, score_learned
 from tensor_stereo.scores.alignment import estimate_alignment
 from tensor_stereo.scores.image_evidence import ImageEvidence
-from tensor_stereo.scores.learned_native import infer_natively, pack_weights
+from tensor_stereo.scores.learned_native import pack_weights, runs_natively
 from tests.oracles import installed_backends
 from tests.scores.learned_oracle import random_pairs
 from tests.scores.test_image_evidence import textured_views
@@ -107,18 +107,17 @@ def test_changed_weights_are_packed_anew() -> None:
 def test_the_kernel_leaves_gradients_and_other_networks_to_torch() -> None:
     matches = random_pairs(8, (40,))
     graphs = build_match_graphs(matches)
-    given = graphs, None, None, "native"
-    assert infer_natively(load_learned(), matches, *given) is not None
+    assert runs_natively(load_learned(), matches, "native")
     moved = replace(matches, keypoints1=matches.keypoints1.clone().requires_grad_())
-    assert infer_natively(load_learned(), moved, *given) is None
+    assert not runs_natively(load_learned(), moved, "native")
     with torch.no_grad():
-        assert infer_natively(load_learned(), moved, *given) is not None
+        assert runs_natively(load_learned(), moved, "native")
     score_learned(moved, graphs).sum().backward()
     assert moved.keypoints1.grad is not None
     assert moved.keypoints1.grad.abs().sum() > 0
-    assert infer_natively(LearnedScore(), matches, *given) is None  # whose weights learn
-    assert infer_natively(LearnedScore(width=8).requires_grad_(False), matches, *given) is None
-    assert infer_natively(load_learned(), matches, graphs, None, None, "scipy") is None
+    assert not runs_natively(LearnedScore(), matches, "native")  # whose weights learn
+    assert not runs_natively(LearnedScore(width=8).requires_grad_(False), matches, "native")
+    assert not runs_natively(load_learned(), matches, "scipy")
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -144,7 +144,7 @@ def test_weights_of_the_package_run_by_run(shown: bool, monkeypatch: pytest.Monk
     for given in (matches, replace(matches, cost=None)):
         seen, network = see(given, evidence), load_learned()
         logit, _ = infer(weights_of(network), seen)
-        found = learned_probabilities(given, build_match_graphs(given), evidence)
+        found = learned_probabilities(given, build_match_graphs(given), evidence, FilterConfig(backend="scipy"))
         # these weights tell by disparities: a logit changes by up to 10 times the difference of a quantity
         np.testing.assert_allclose(found, calibrate(weights_of(network), logit), rtol=0, atol=1e-3)
     assert sizes == [40, 1, 45, 5] * 2

@@ -22,7 +22,7 @@ from tensor_stereo.configs import PipelineConfig
 from tensor_stereo.features import detect_features
 from tensor_stereo.types import Matches
 
-LEAST_SUPPORT = 4.0  # neighbours of like flow, libviso2's matcher
+LEAST_SUPPORT = 4 / 6  # of the neighbours have like flow: libviso2's four, of the six that there are on average
 LINE_PX = 4.0  # COLMAP's default for guided matching
 PATCH_RADIUS_PX, SEARCH_STEPS, SEARCH_PX = 7, 9, 1.0
 NUM_NEIGHBORS = 6

@@ -15,6 +15,9 @@ from tensor_stereo.ops._row_overlap import row_overlap as row_overlap
 from tensor_stereo.ops._soft_counts import soft_counts as soft_counts
 from tensor_stereo.ops._soft_counts import soft_counts_backward as soft_counts_backward
 from tensor_stereo.ops._soft_match_graphs import soft_match_graphs as soft_match_graphs
+from tensor_stereo.ops._window_evidence import window_evidence as window_evidence
+from tensor_stereo.ops._window_refine import window_refine as window_refine
+from tensor_stereo.ops._window_search import window_search as window_search
 from tensor_stereo.ops.backends import BackendInfo as BackendInfo
 from tensor_stereo.ops.backends import backend as backend
 from tensor_stereo.ops.backends import resolve_backend as resolve_backend

@@ -18,6 +18,10 @@ struct Dense {
     alignas(64) float weight[kIn][padded(kOut)];
     alignas(64) float bias[padded(kOut)];
 
+    // Vectors of N numbers that hold the outputs.
+    template <int N>
+    static constexpr int parts = (kOut + N - 1) / N;
+
     explicit Dense(const Linear& given) {
         for (int k = 0; k < kIn; ++k) {
             for (int o = 0; o < padded(kOut); ++o) weight[k][o] = o < kOut ? given.weight[o * kIn + k] : 0;
@@ -25,20 +29,41 @@ struct Dense {
         for (int o = 0; o < padded(kOut); ++o) bias[o] = o < kOut && given.bias != nullptr ? given.bias[o] : 0;
     }
 
-    // Adds the product to `out`.
+    // Adds the product to what N outputs at a time hold.
     template <int N>
-    TENSOR_STEREO_INLINE void add(const float* in, float* out) const {
-        constexpr int kParts = (kOut + N - 1) / N;
-        Lanes<N> sum[kParts];
-        for (int p = 0; p < kParts; ++p) load(out + p * N, sum[p]);
-        for (int k = 0; k < kIn; ++k) {
+    TENSOR_STEREO_INLINE void add(const float* in, Lanes<N> (&total)[parts<N>]) const {
+        constexpr int kParts = parts<N>;
+        // Several sums at a time: each addition waits for the one before.
+        constexpr int kChains = std::min(kIn, kParts >= 4 ? 1 : kParts >= 2 ? 3 : 5);
+        Lanes<N> sum[kChains][kParts] = {};
+        constexpr int kWhole = kIn / kChains * kChains;
+        for (int k = 0; k < kWhole; k += kChains) {
+            for (int c = 0; c < kChains; ++c) {
+                for (int p = 0; p < kParts; ++p) {
+                    Lanes<N> row;
+                    load(weight[k + c] + p * N, row);
+                    sum[c][p] += row * in[k + c];
+                }
+            }
+        }
+        for (int k = kWhole; k < kIn; ++k) {
             for (int p = 0; p < kParts; ++p) {
                 Lanes<N> row;
                 load(weight[k] + p * N, row);
-                sum[p] += row * in[k];
+                sum[0][p] += row * in[k];
             }
         }
-        for (int p = 0; p < kParts; ++p) store(sum[p], out + p * N);
+        for (int c = 0; c < kChains; ++c) {
+            for (int p = 0; p < kParts; ++p) total[p] += sum[c][p];
+        }
+    }
+
+    template <int N>
+    TENSOR_STEREO_INLINE void add(const float* in, float* out) const {
+        Lanes<N> total[parts<N>];
+        for (int p = 0; p < parts<N>; ++p) load(out + p * N, total[p]);
+        add<N>(in, total);
+        for (int p = 0; p < parts<N>; ++p) store(total[p], out + p * N);
     }
 
     template <int N>

@@ -182,7 +182,7 @@ TENSOR_STEREO_INLINE void measure_links(const Pair& pair, Workspace& work) {
     const auto size = static_cast<std::int64_t>(work.links.size());
     for (std::int64_t first = 0; first < size; first += N) {
         const int some = static_cast<int>(std::min<std::int64_t>(N, size - first));
-        alignas(64) float x0[N] = {}, y0[N] = {}, x1[N] = {}, y1[N] = {}, both[N] = {};
+        alignas(64) float x0[N] = {}, y0[N] = {}, x1[N] = {}, y1[N] = {}, in0[N] = {}, in1[N] = {};
         alignas(64) float fine[N] = {};
         for (int l = 0; l < some; ++l) {
             const Link& link = work.links[first + l];
@@ -190,11 +190,13 @@ TENSOR_STEREO_INLINE void measure_links(const Pair& pair, Workspace& work) {
             y0[l] = left[2 * link.j + 1] - left[2 * link.i + 1];
             x1[l] = right[2 * link.j] - right[2 * link.i];
             y1[l] = right[2 * link.j + 1] - right[2 * link.i + 1];
-            both[l] = link.in0 * link.in1;
+            in0[l] = link.in0;
+            in1[l] = link.in1;
             fine[l] = std::abs(work.refined[link.j] - work.refined[link.i]);
         }
-        V a, b, c, d, shared, apart;
-        load(x0, a), load(y0, b), load(x1, c), load(y1, d), load(both, shared), load(fine, apart);
+        V a, b, c, d, first_view, other_view, apart;
+        load(x0, a), load(y0, b), load(x1, c), load(y1, d);
+        load(in0, first_view), load(in1, other_view), load(fine, apart);
         const V length0 = root_of(a * a + b * b + kTinyPx2), length1 = root_of(c * c + d * d + kTinyPx2);
         const V step = a - c, gap = magnitude(step), row_gap = magnitude(b - d);
         const V log_length = log_of(length0), relative = gap / length0, same = exp_of(gap * (1 / -0.7f));
@@ -206,29 +208,34 @@ TENSOR_STEREO_INLINE void measure_links(const Pair& pair, Workspace& work) {
                                    exp_of(-8.0f * relative),
                                    exp_of(-row_gap),
                                    log_of(1.0f + row_gap),
-                                   V{},
-                                   V{},
+                                   first_view,
+                                   other_view,
                                    log_length,
                                    log_of(length1) - log_length,
-                                   same * shared,
+                                   same * first_view * other_view,
                                    magnitude(b) / length0,
                                    tanh_of(step * 0.25f) * a / length0};
         const V odd[kOdd] = {tanh_of(step * 0.5f), tanh_of(step * 0.125f)};
         const V long0 = limited(length0, 1, 3e38f);
         const V fine_columns[kRefined] = {exp_of(apart * (1 / -0.3f)), exp_of(-apart), log_of(1.0f + apart),
                                           exp_of(-27.0f * apart / long0)};
+        alignas(64) float told[kEdges][N], odds[kOdd][N], refined[kRefined][N], lengths[N];
+        for (int k = 0; k < kEdges; ++k) {
+            const float mean = scales.edges.mean[k], scale = scales.edges.scale[k];
+            store(limited(columns[k] * scale - mean * scale, -4, 4), told[k]);
+        }
+        for (int k = 0; k < kOdd; ++k) store(odd[k], odds[k]);
+        for (int k = 0; k < kRefined; ++k) store(fine_columns[k], refined[k]);
+        store(length0, lengths);
         for (int l = 0; l < some; ++l) {
             Link& link = work.links[first + l];
-            for (int k = 0; k < kEdges; ++k) link.edge[k] = columns[k][l];
-            link.edge[8] = link.in0;
-            link.edge[9] = link.in1;
-            for (int k = 0; k < kEdges; ++k) link.edge[k] = normalize(link.edge[k], scales.edges, k);
-            for (int k = 0; k < kOdd; ++k) link.odd[k] = odd[k][l];
+            for (int k = 0; k < kEdges; ++k) link.edge[k] = told[k][l];
+            for (int k = 0; k < kOdd; ++k) link.odd[k] = odds[k][l];
             link.way_x = x0[l];
             link.way_y = y0[l];
-            link.length = length0[l];
+            link.length = lengths[l];
             for (int k = 0; k < kRefined; ++k) {
-                link.image_i[2 * kCurves + 1 + k] = link.image_j[2 * kCurves + 1 + k] = fine_columns[k][l];
+                link.image_i[2 * kCurves + 1 + k] = link.image_j[2 * kCurves + 1 + k] = refined[k][l];
             }
         }
     }
@@ -376,12 +383,35 @@ TENSOR_STEREO_INLINE void enter(const Pair& pair, Workspace& work) {
     }
 }
 
-TENSOR_STEREO_INLINE void mean_state(const Workspace& work, std::int64_t count, float* mean) {
-    const float share = 1 / static_cast<float>(count);
-    std::fill_n(mean, kSpace, 0.0f);
-    for (std::int64_t m = 0; m < count; ++m) {
-        for (int k = 0; k < kSpace; ++k) mean[k] += work.state[m * kSpace + k] * share;
+// The sum of the state of a match, whose padding is zero.
+template <int N>
+TENSOR_STEREO_INLINE float sum_of(const float* values) {
+    Lanes<N> sum = {};
+    for (int k = 0; k < kSpace; k += N) {
+        Lanes<N> part;
+        load(values + k, part);
+        sum += part;
     }
+    alignas(64) float lane[N];
+    store(sum, lane);
+    for (int half = N / 2; half > 0; half /= 2) {
+        for (int l = 0; l < half; ++l) lane[l] += lane[l + half];
+    }
+    return lane[0];
+}
+
+template <int N>
+TENSOR_STEREO_INLINE void mean_state(const Workspace& work, std::int64_t count, float* mean) {
+    constexpr int kParts = kSpace / N;
+    Lanes<N> sum[kParts] = {};
+    for (std::int64_t m = 0; m < count; ++m) {
+        for (int p = 0; p < kParts; ++p) {
+            Lanes<N> part;
+            load(work.state.data() + m * kSpace + p * N, part);
+            sum[p] += part;
+        }
+    }
+    for (int p = 0; p < kParts; ++p) store(sum[p] / static_cast<float>(count), mean + p * N);
 }
 
 // Sums over the neighbours of a match, for its plane: 1, x x, x y, y y, x, y, gap x, gap y, gap.
@@ -431,7 +461,9 @@ TENSOR_STEREO_INLINE void measure_planes(const Workspace& work, std::int64_t cou
         found[k++] = log_of(1.0f + total);
         const std::int64_t some = std::min<std::int64_t>(N, count - first);
         for (int c = 0; c < k; ++c) {
-            for (std::int64_t l = 0; l < some; ++l) columns[(first + l) * kStep + c] = found[c][l];
+            alignas(64) float column[N];
+            store(found[c], column);
+            for (std::int64_t l = 0; l < some; ++l) columns[(first + l) * kStep + c] = column[l];
         }
     }
 }
@@ -442,7 +474,7 @@ TENSOR_STEREO_INLINE void pass_messages(const Layers::MessageRound& round, bool 
     constexpr int kMessageSpace = padded(kMessage), kStep = padded(kRefinedPlanes);
     const std::int64_t count = pair.count;
     alignas(64) float mean[kSpace], whole[kSpace];
-    mean_state(work, count, mean);
+    mean_state<N>(work, count, mean);
     round.whole.apply<N>(mean, whole);
     work.hear.resize(count * kMessageSpace);
     work.tell.resize(count * kMessageSpace);
@@ -452,19 +484,28 @@ TENSOR_STEREO_INLINE void pass_messages(const Layers::MessageRound& round, bool 
         round.tell.apply<N>(work.state.data() + m * kSpace, work.tell.data() + m * kMessageSpace);
     }
     for (const Link& link : work.links) {
-        alignas(64) float between[kMessageSpace], odd[kMessageSpace], to[kMessageSpace];
-        round.edge.apply<N>(link.edge, between);
-        round.odd.apply<N>(link.odd, odd);
+        constexpr int kParts = Dense<kEdges, kMessage>::parts<N>;
+        Lanes<N> between[kParts] = {}, odd[kParts] = {};
+        round.edge.template add<N>(link.edge, between);
+        round.odd.template add<N>(link.odd, odd);
         const std::int64_t ends[2] = {link.i, link.j};
         for (int e = 0; e < 2; ++e) {
             const float* const hear = work.hear.data() + ends[e] * kMessageSpace;
             const float* const tell = work.tell.data() + ends[1 - e] * kMessageSpace;
-            for (int k = 0; k < kMessageSpace; ++k) {
-                to[k] = (between[k] + hear[k]) + tell[k] + (e == 0 ? odd[k] : -odd[k]);
+            Lanes<N> to[kParts];
+            for (int p = 0; p < kParts; ++p) {
+                Lanes<N> mine, other;
+                load(hear + p * N, mine);
+                load(tell + p * N, other);
+                to[p] = between[p] + mine + other + (e == 0 ? odd[p] : -odd[p]);
             }
-            if (pair.has_images) round.edge_image.add<N>(e == 0 ? link.image_i : link.image_j, to);
+            if (pair.has_images) round.edge_image.template add<N>(e == 0 ? link.image_i : link.image_j, to);
             float* const heard = work.heard.data() + ends[e] * kMessageSpace;
-            for (int k = 0; k < kMessageSpace; ++k) heard[k] += std::max(to[k], 0.0f);
+            for (int p = 0; p < kParts; ++p) {
+                Lanes<N> sum;
+                load(heard + p * N, sum);
+                store(sum + (to[p] > 0.0f ? to[p] : Lanes<N>{}), heard + p * N);
+            }
         }
     }
     if (has_plane) {
@@ -498,14 +539,12 @@ TENSOR_STEREO_INLINE void pass_messages(const Layers::MessageRound& round, bool 
         }
         relu<kSpace>(mixed);
         round.out.apply<N>(mixed, out);
-        float sum = 0, squares = 0;
-        for (int k = 0; k < kWidth; ++k) sum += state[k] += out[k];
-        const float middle = sum / kWidth;
-        for (int k = 0; k < kWidth; ++k) squares += (state[k] - middle) * (state[k] - middle);
-        const float spread = 1 / std::sqrt(squares / kWidth + 1e-5f);
-        for (int k = 0; k < kWidth; ++k) {
-            state[k] = (state[k] - middle) * spread * round.norm.mean[k] + round.norm.scale[k];
-        }
+        for (int k = 0; k < kSpace; ++k) state[k] += out[k];
+        const float middle = sum_of<N>(state) / kWidth;
+        for (int k = 0; k < kWidth; ++k) state[k] -= middle;
+        for (int k = 0; k < kSpace; ++k) out[k] = state[k] * state[k];
+        const float spread = 1 / std::sqrt(sum_of<N>(out) / kWidth + 1e-5f);
+        for (int k = 0; k < kWidth; ++k) state[k] = state[k] * spread * round.norm.mean[k] + round.norm.scale[k];
     }
 }
 
@@ -526,7 +565,7 @@ TENSOR_STEREO_INLINE void score_pair(const Job& job, std::int64_t b, Workspace& 
     enter<N>(pair, work);
     for (int r = 0; r < kRounds; ++r) pass_messages<N>(job.layers.rounds[r], r > 1, pair, work);
     alignas(64) float mean[kSpace], whole[kSpace], hidden[kSpace], out[padded(kTolerances)];
-    mean_state(work, count, mean);
+    mean_state<N>(work, count, mean);
     job.layers.head_whole.apply<N>(mean, whole);
     for (std::int64_t m = 0; m < count; ++m) {
         job.layers.head.apply<N>(work.state.data() + m * kSpace, hidden);

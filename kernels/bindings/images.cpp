@@ -59,10 +59,10 @@ nb::ndarray<nb::numpy, float, nb::ndim<3>> give_curve(ts::Buffer<float> values, 
     return {data, {rows, ts::kEvidenceCurves, width}, owner_of(data)};
 }
 
-auto window_evidence(const Images& images0, const Images& images1, const Images& known1, FloatPoints origin, Floats brighter, FloatPoints left,
-                     FloatPoints right, FloatPoints along, Floats disparity, Floats across, FloatPoints slope,
-                     Integers ptr, Integers first, Integers count, Flags has_rows, Flags rectified, std::int64_t width,
-                     int num_threads, int vectors) {
+auto window_evidence(const Images& images0, const Images& images1, const Images& known1, FloatPoints origin,
+                     Floats brighter, FloatPoints left, FloatPoints right, FloatPoints along, Floats disparity,
+                     Floats across, FloatPoints slope, Integers ptr, Integers first, Integers count, Flags has_rows,
+                     Flags rectified, std::int64_t width, int num_threads, int vectors) {
     const std::size_t num_pairs = images0.size(), num_matches = left.shape(0);
     check(images1.size() == num_pairs && known1.size() == num_pairs && origin.shape(0) == num_pairs &&
               brighter.shape(0) == num_pairs && first.shape(0) == num_pairs && count.shape(0) == num_pairs &&
@@ -92,12 +92,11 @@ auto window_evidence(const Images& images0, const Images& images1, const Images&
     auto start = ts::allocate<float>(num_matches), offset = ts::allocate<float>(num_matches);
     {
         const nb::gil_scoped_release release;
-        ts::window_evidence(pairs.data(), static_cast<std::int64_t>(num_pairs),
-                            {ptr.data(), left.data(), right.data(), along.data(), disparity.data(), across.data(),
-                             slope.data()},
-                            num_threads,
-                            {values.get(), {curve0.get(), curve1.get()}, start.get(), offset.get(), width},
-                            static_cast<ts::Vectors>(vectors));
+        ts::window_evidence(
+            pairs.data(), static_cast<std::int64_t>(num_pairs),
+            {ptr.data(), left.data(), right.data(), along.data(), disparity.data(), across.data(), slope.data()},
+            num_threads, {values.get(), {curve0.get(), curve1.get()}, start.get(), offset.get(), width},
+            static_cast<ts::Vectors>(vectors));
     }
     return std::tuple(give_rows<ts::kEvidenceValues>(std::move(values), num_matches),
                       give_curve(std::move(curve0), num_matches, static_cast<std::size_t>(width)),
@@ -106,9 +105,9 @@ auto window_evidence(const Images& images0, const Images& images1, const Images&
 }
 
 auto window_search(const Images& images0, const Images& images1, const Images& known1, FloatPoints origin,
-                   Floats brighter, FloatPoints points, FloatPoints along, Floats across, Input<float, nb::ndim<2>> predicted,
-                   Integers ptr, Integers first, Integers count, Flags rectified, float near_px, int num_threads,
-                   int vectors) {
+                   Floats brighter, FloatPoints points, FloatPoints along, Floats across,
+                   Input<float, nb::ndim<2>> predicted, Integers ptr, Integers first, Integers count, Flags rectified,
+                   float near_px, int num_threads, int vectors) {
     const std::size_t num_pairs = images0.size(), num_keypoints = points.shape(0);
     check(images1.size() == num_pairs && known1.size() == num_pairs && origin.shape(0) == num_pairs &&
               brighter.shape(0) == num_pairs && first.shape(0) == num_pairs && count.shape(0) == num_pairs &&

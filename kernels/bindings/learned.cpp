@@ -113,7 +113,8 @@ auto learned_network(Floats weights, Integers ptr, Points points0, Points points
                   "evidence must have one row per match");
         }
         for (std::size_t m = 0; m < num_matches; ++m) {
-            check((*num_columns)(m) >= 0 && (*num_columns)(m) <= width, "evidence must have as many columns as it says");
+            check((*num_columns)(m) >= 0 && (*num_columns)(m) <= width,
+                  "evidence must have as many columns as it says");
         }
     }
     const ts::learned::Weights read = read_weights(weights);

@@ -7,14 +7,17 @@
 #include <numeric>
 #include <vector>
 
+#include "dispatch.hpp"
+#include "lanes.hpp"
 #include "tensor_stereo/parallel.hpp"
 
 namespace tensor_stereo {
 namespace {
 
-constexpr std::int64_t kLanes = 16;
+constexpr std::int64_t kLanes = kMaxLanes;
 
-inline float sum_of_squared_differences(const float* a, const float* b, std::int64_t size) noexcept {
+// Of sixteen sums side by side, whatever the instructions: compiled for each of them, it gives the same bits.
+TENSOR_STEREO_INLINE float sum_of_squared_differences(const float* a, const float* b, std::int64_t size) noexcept {
     float lane[kLanes] = {};
     std::int64_t k = 0;
     for (; k + kLanes <= size; k += kLanes) {
@@ -36,8 +39,8 @@ inline float sum_of_squared_differences(const float* a, const float* b, std::int
 // Matches one image with its partner.
 class ImageMatcher {
    public:
-    void match(const FeatureView& view0, const FeatureView& view1, std::int64_t b, std::int64_t size, const Gate& gate,
-               const Neighbors& result) {
+    TENSOR_STEREO_INLINE void match(const FeatureView& view0, const FeatureView& view1, std::int64_t b,
+                                    std::int64_t size, const Gate& gate, const Neighbors& result) {
         const std::int64_t start1 = view1.ptr[b], count1 = view1.ptr[b + 1] - start1;
         sort_by_row(view1.keypoints + 2 * start1, count1);
         for (std::int64_t i = view0.ptr[b]; i < view0.ptr[b + 1]; ++i) {
@@ -85,6 +88,20 @@ class ImageMatcher {
     std::vector<double> rows_, columns_;
 };
 
+// The images from begin to end.
+struct Images {
+    const FeatureView &view0, &view1;
+    std::int64_t begin, end, size;
+    const Gate& gate;
+    const Neighbors& result;
+    ImageMatcher& matcher;
+
+    template <int>
+    TENSOR_STEREO_INLINE void run() const {
+        for (std::int64_t b = begin; b < end; ++b) matcher.match(view0, view1, b, size, gate, result);
+    }
+};
+
 }  // namespace
 
 void gated_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t num_images, std::int64_t size,
@@ -98,7 +115,7 @@ void gated_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t 
     std::fill_n(result.index1, num1, -1);
     parallel_for(num_images, 1, num_threads, [&] {
         return [&, matcher = ImageMatcher()](std::int64_t begin, std::int64_t end) mutable {
-            for (std::int64_t b = begin; b < end; ++b) matcher.match(view0, view1, b, size, gate, result);
+            run_with(Vectors::kBest, Images{view0, view1, begin, end, size, gate, result, matcher});
         };
     });
 }

@@ -91,11 +91,11 @@ struct Layers {
 struct Link {
     std::int64_t i, j;
     float in0, in1;
-    float edge[kEdges];                                 // normalised
-    float odd[kOdd];                                    // from i to j
+    float edge[kEdges];                                // normalised
+    float odd[kOdd];                                   // from i to j
     float image_i[kEdgeImages], image_j[kEdgeImages];  // normalised
-    float way_x, way_y, length;                         // px of view 0
-    float step_x, step_y;                               // the same over the mean distance of both to their neighbours
+    float way_x, way_y, length;                        // px of view 0
+    float step_x, step_y;                              // the same over the mean distance of both to their neighbours
 };
 
 struct Workspace {
@@ -253,7 +253,8 @@ TENSOR_STEREO_INLINE void look_up(const Pair& pair, std::int64_t near, std::int6
     const bool is_far = is_known && std::abs(other - own) >= 0.5;
     for (int v = 0; v < 2; ++v) {
         for (int c = 0; c < kCurves; ++c) {
-            const std::int64_t place = (near * kCurves + c) * given.width + (is_far ? static_cast<std::int64_t>(column) : 0);
+            const std::int64_t place =
+                (near * kCurves + c) * given.width + (is_far ? static_cast<std::int64_t>(column) : 0);
             columns[v * kCurves + c] = is_far ? given.curve[v][place] : 0;
         }
     }
@@ -311,7 +312,8 @@ TENSOR_STEREO_INLINE bool rank_costs(const Pair& pair, Workspace& work) {
     }
     work.order.resize(pair.count);
     for (std::int64_t m = 0; m < pair.count; ++m) work.order[m] = m;
-    std::sort(work.order.begin(), work.order.end(), [cost](std::int64_t a, std::int64_t b) { return cost[a] < cost[b]; });
+    std::sort(work.order.begin(), work.order.end(),
+              [cost](std::int64_t a, std::int64_t b) { return cost[a] < cost[b]; });
     double mean = 0;
     std::vector<double> logs(pair.count);
     for (std::int64_t m = 0; m < pair.count; ++m) mean += logs[m] = std::log(cost[m] - least + 1e-3);
@@ -325,8 +327,7 @@ TENSOR_STEREO_INLINE bool rank_costs(const Pair& pair, Workspace& work) {
             const std::int64_t m = work.order[begin];
             const double rank = (middle + 0.5) / static_cast<double>(pair.count);
             work.cost[kCosts * m] = normalize(static_cast<float>(rank), scale, 0);
-            work.cost[kCosts * m + 1] =
-                normalize(static_cast<float>(std::clamp(logs[m] - mean, -5.0, 5.0)), scale, 1);
+            work.cost[kCosts * m + 1] = normalize(static_cast<float>(std::clamp(logs[m] - mean, -5.0, 5.0)), scale, 1);
         }
     }
     return true;
@@ -372,7 +373,8 @@ TENSOR_STEREO_INLINE void enter(const Pair& pair, Workspace& work) {
         layers.enter.apply<N>(in, entered);
         if (pair.has_images && work.has_image[m] > 0) {
             alignas(64) float image[kImages];
-            for (int k = 0; k < kImages; ++k) image[k] = normalize(given.image[row * kImages + k], layers.scales.image, k);
+            for (int k = 0; k < kImages; ++k)
+                image[k] = normalize(given.image[row * kImages + k], layers.scales.image, k);
             layers.enter_image.apply<N>(image, hidden);
             relu<kSpace>(hidden);
             layers.enter_image_out.apply<N>(hidden, seen);
@@ -433,7 +435,8 @@ TENSOR_STEREO_INLINE void measure_planes(const Workspace& work, std::int64_t cou
             const float sign = e == 0 ? 1.0f : -1.0f, trust = work.belief[far];
             const float x = link.step_x, y = link.step_y;
             const float gap = std::clamp(other[far] - work.disparity[near], -kMaxGapPx, kMaxGapPx);
-            const float terms[kSums] = {1, x * x, x * y, y * y, sign * x, sign * y, sign * gap * x, sign * gap * y, gap};
+            const float terms[kSums] = {1,        x * x,          x * y,          y * y, sign * x,
+                                        sign * y, sign * gap * x, sign * gap * y, gap};
             for (int k = 0; k < kSums; ++k) sums[k * room + near] += terms[k] * trust;
         }
     }

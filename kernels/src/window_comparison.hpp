@@ -130,8 +130,7 @@ TENSOR_STEREO_INLINE void prepare(const Strip& window, Anchor& anchor) {
     weigh<N>(anchor, anchor.pixel[kPixels / 2], 10.0f, 8.0f, 1e-5f, true, anchor.tight);
     for (int w = 0; w < kNumWindows; ++w) {
         const float* const weights = w == kLike ? anchor.like : w == kTight ? anchor.tight : kPattern.weight[w];
-        const float mean =
-            sum_pixels<N>([&](int k) { return read<N>(weights + k) * read<N>(anchor.pixel + k); });
+        const float mean = sum_pixels<N>([&](int k) { return read<N>(weights + k) * read<N>(anchor.pixel + k); });
         anchor.mean[w] = mean;
         anchor.variance[w] = sum_pixels<N>([&](int k) {
             const Lanes<N> apart = read<N>(anchor.pixel + k) - mean;

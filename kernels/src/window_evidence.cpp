@@ -20,10 +20,11 @@ constexpr int kDisc = 4;                // px, radius of what is searched where 
 constexpr float kNowhere = 20;          // log SSD of a place outside of the image
 constexpr float kTie = 1e-3f;           // log SSDs that near are alike; rounding must not choose between them
 constexpr float kMaxLog = 6;            // log ratios of SSDs are cut there
-constexpr float kGood = 0.3f, kGoodWidth = 0.05f;  // by how much a rival may be worse and counts, and a half of the ramp
-constexpr float kLeastBend = 0.03f;     // of the parabola through three SSDs, of the least one; less is noise
-constexpr float kAlone = 100;           // px, of a rival that there is not
-constexpr float kFarPlace = 1e4f;        // from the first disparity; what lies beyond is told by 5 at most
+constexpr float kGood = 0.3f,
+                kGoodWidth = 0.05f;  // by how much a rival may be worse and counts, and a half of the ramp
+constexpr float kLeastBend = 0.03f;  // of the parabola through three SSDs, of the least one; less is noise
+constexpr float kAlone = 100;        // px, of a rival that there is not
+constexpr float kFarPlace = 1e4f;    // from the first disparity; what lies beyond is told by 5 at most
 constexpr std::int64_t kMatchesAtOnce = 16;
 constexpr Window kCurves[kEvidenceCurves] = {kLike, kTight}, kSlanted[kSlantedWindows] = {kMiddle, kLike};
 
@@ -243,7 +244,8 @@ TENSOR_STEREO_INLINE void measure(const EvidencePair& pair, const EvidenceMatche
     const Place points[2] = {{matches.left[2 * m], matches.left[2 * m + 1]},
                              {matches.right[2 * m], matches.right[2 * m + 1]}};
     const Look looks[2] = {{pair.view[0], pair.is_rectified, along}, {pair.view[1], pair.is_rectified, along}};
-    const float disparity = bounded(matches.disparity[m]), slope_x = matches.slope[2 * m], slope_y = matches.slope[2 * m + 1];
+    const float disparity = bounded(matches.disparity[m]), slope_x = matches.slope[2 * m],
+                slope_y = matches.slope[2 * m + 1];
     const auto count = static_cast<int>(pair.count);
     const float start = pair.has_rows ? static_cast<float>(pair.first) : std::nearbyint(disparity) - kDisc;
     const float own = std::clamp(std::nearbyint(disparity - start), -kFarPlace, kFarPlace);
@@ -256,10 +258,10 @@ TENSOR_STEREO_INLINE void measure(const EvidencePair& pair, const EvidenceMatche
     for (int v = 0; v < 2; ++v) {
         const float stretch = v == 0 ? -(1 + slope_x / 2) : 1 - slope_x / 2;
         const float across = v == 0 ? matches.across[m] : -matches.across[m];
-        const Search query{looks[1 - v], points[v],         points[1 - v], across, slope_x / stretch, slope_y / stretch,
-                           start,        own,               count,         v == 0, pair.has_rows};
+        const Search query{looks[1 - v], points[v], points[1 - v], across, slope_x / stretch, slope_y / stretch,
+                           start,        own,       count,         v == 0, pair.has_rows};
         offset += measure_view<N>(query, work.anchor[v], work.windows[v], work, values + v * kEvidenceOfView,
-                               result.curve[v] + m * kEvidenceCurves * result.width, result.width);
+                                  result.curve[v] + m * kEvidenceCurves * result.width, result.width);
     }
     const float brighter = std::abs(middle_level(work.windows[0]) - middle_level(work.windows[1])) / 16;
     const float beyond = std::max(-own, 0.0f) + std::max((own - static_cast<float>(count)) + 1, 0.0f);
@@ -295,8 +297,8 @@ struct Range {
 
 }  // namespace
 
-void window_evidence(const EvidencePair* pairs, std::int64_t num_pairs, const EvidenceMatches& matches,
-                     int num_threads, const Evidence& result, Vectors vectors) {
+void window_evidence(const EvidencePair* pairs, std::int64_t num_pairs, const EvidenceMatches& matches, int num_threads,
+                     const Evidence& result, Vectors vectors) {
     const Job job{pairs, num_pairs, matches, result};
     parallel_for(matches.ptr[num_pairs], kMatchesAtOnce, num_threads, [&] {
         return [&, work = std::make_unique<Workspace>()](std::int64_t begin, std::int64_t end) mutable {

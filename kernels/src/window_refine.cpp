@@ -16,10 +16,10 @@ namespace {
 
 constexpr std::int64_t kMatchesAtOnce = 16;
 constexpr int kSteps = 4;
-constexpr float kLongest = 0.5f;    // px, of a step
-constexpr float kApart = 0.25f;     // px, of the samples that give the slope of the grey levels
-constexpr float kDamping = 1;       // grey levels squared per px squared; flat windows stay
-constexpr float kNumPixels = 40;    // that tell independently, of a window
+constexpr float kLongest = 0.5f;  // px, of a step
+constexpr float kApart = 0.25f;   // px, of the samples that give the slope of the grey levels
+constexpr float kDamping = 1;     // grey levels squared per px squared; flat windows stay
+constexpr float kNumPixels = 40;  // that tell independently, of a window
 
 struct Pixels {
     alignas(64) float value[kPaddedPixels];
@@ -59,8 +59,7 @@ TENSOR_STEREO_INLINE void differ(const Match& match, float along, float across, 
         }
     }
     for (int k = kPixels; k < kPaddedPixels; ++k) result.value[k] = 0;
-    const float mean =
-        sum_pixels<N>([&](int k) { return read<N>(anchor.tight + k) * read<N>(result.value + k); });
+    const float mean = sum_pixels<N>([&](int k) { return read<N>(anchor.tight + k) * read<N>(result.value + k); });
     for (int k = 0; k < kPaddedPixels; k += N) store(read<N>(result.value + k) - mean, result.value + k);
 }
 

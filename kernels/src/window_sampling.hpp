@@ -195,11 +195,11 @@ class Look {
             }
             const float x = std::nearbyint((start.x - image_.origin[0]) + ahead * axes_.along.x);
             const float y = std::nearbyint((start.y - image_.origin[1]) + ahead * axes_.along.y);
-            const bool is_inside = x >= 0 && y >= 0 && x < static_cast<float>(image_.width) &&
-                                   y < static_cast<float>(image_.height);
-            found[k] = !is_inside || (image_.known != nullptr &&
-                                      !image_.known[static_cast<std::int64_t>(y) * image_.width +
-                                                    static_cast<std::int64_t>(x)]);
+            const bool is_inside =
+                x >= 0 && y >= 0 && x < static_cast<float>(image_.width) && y < static_cast<float>(image_.height);
+            found[k] = !is_inside ||
+                       (image_.known != nullptr &&
+                        !image_.known[static_cast<std::int64_t>(y) * image_.width + static_cast<std::int64_t>(x)]);
         }
     }
 

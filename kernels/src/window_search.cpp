@@ -16,8 +16,8 @@ namespace tensor_stereo {
 namespace {
 
 constexpr std::int64_t kKeypointsAtOnce = 16;
-constexpr float kNowhere = 40;        // log SSD of a place that is not looked at
-constexpr float kLeastBend = 0.03f;   // of the parabola through three SSDs, of the least one; less is noise
+constexpr float kNowhere = 40;       // log SSD of a place that is not looked at
+constexpr float kLeastBend = 0.03f;  // of the parabola through three SSDs, of the least one; less is noise
 
 struct Workspace {
     Strip window, strip;
@@ -69,7 +69,8 @@ TENSOR_STEREO_INLINE void search_keypoint(const SearchPair& pair, const Job& job
         }
         work.allowed[k] = is_near && !work.outside[k];
         is_any = is_any || work.allowed[k];
-        if (is_near) std::fill(work.wanted.get() + std::max(k - 1, 0), work.wanted.get() + std::min(k + 2, count), true);
+        if (is_near)
+            std::fill(work.wanted.get() + std::max(k - 1, 0), work.wanted.get() + std::min(k + 2, count), true);
     }
     job.found[t] = is_any;
     if (!is_any) {  // the middle of the first three, as of places that all cost the same
@@ -84,7 +85,8 @@ TENSOR_STEREO_INLINE void search_keypoint(const SearchPair& pair, const Job& job
         other.strip(start, some + 2 * kWindowRadius, work.strip);
         for (int k = 0; k < some; k += N) {
             const int end = std::min(k + N, some);
-            if (std::none_of(work.wanted.get() + first + k, work.wanted.get() + first + end, [](bool is) { return is; })) {
+            if (std::none_of(work.wanted.get() + first + k, work.wanted.get() + first + end,
+                             [](bool is) { return is; })) {
                 continue;
             }
             compare_lanes<N, false>(work.anchor, work.strip, k, work.found);

@@ -54,16 +54,15 @@ Found measure(ts::Vectors vectors, int num_threads, bool is_rectified) {
     found.curve1.resize(found.curve0.size());
     found.start.resize(count);
     found.offset.resize(count);
-    ts::window_evidence(&pair, 1,
-                        {ptr, points0.data(), points1.data(), along.data(), disparity.data(), across.data(),
-                         slope.data()},
-                        num_threads,
-                        {found.values.data(),
-                         {found.curve0.data(), found.curve1.data()},
-                         found.start.data(),
-                         found.offset.data(),
-                         kCount},
-                        vectors);
+    ts::window_evidence(
+        &pair, 1, {ptr, points0.data(), points1.data(), along.data(), disparity.data(), across.data(), slope.data()},
+        num_threads,
+        {found.values.data(),
+         {found.curve0.data(), found.curve1.data()},
+         found.start.data(),
+         found.offset.data(),
+         kCount},
+        vectors);
     return found;
 }
 

@@ -41,10 +41,10 @@ struct Weights {
 
 // M matches of B pairs, pair by pair, and their graphs in CSR form with rising columns.
 struct LearnedInputs {
-    const std::int64_t* ptr;    // (B + 1)
-    const double* points[2];    // (M, 2) px, aligned
-    const bool* has_rows;       // (B)
-    const double* cost;         // (M); null: none
+    const std::int64_t* ptr;  // (B + 1)
+    const double* points[2];  // (M, 2) px, aligned
+    const bool* has_rows;     // (B)
+    const double* cost;       // (M); null: none
     const std::int64_t* crow[2];
     const std::int64_t* cols[2];
     // What the images say; null: nothing.

@@ -9,12 +9,12 @@
 namespace tensor_stereo {
 
 constexpr std::int64_t kMaxSearched = 256;  // places along a row or line
-constexpr std::int64_t kMaxInDisc = 9;     // in each row of a disc
-constexpr int kNearPlaces = 7;        // around the match
-constexpr int kSlantedWindows = 2;    // 11 x 11, like the middle
-constexpr int kEvidenceCurves = 2;    // like the middle, near and like it
-constexpr int kEvidenceOfView = kWholeWindows * (kNearPlaces + 7) + 2 * kHalfWindows + 1 +
-                                kSlantedWindows * (kNearPlaces + 3);
+constexpr std::int64_t kMaxInDisc = 9;      // in each row of a disc
+constexpr int kNearPlaces = 7;              // around the match
+constexpr int kSlantedWindows = 2;          // 11 x 11, like the middle
+constexpr int kEvidenceCurves = 2;          // like the middle, near and like it
+constexpr int kEvidenceOfView =
+    kWholeWindows * (kNearPlaces + 7) + 2 * kHalfWindows + 1 + kSlantedWindows * (kNearPlaces + 3);
 constexpr int kEvidenceValues = 2 * kEvidenceOfView + 2;
 
 // What is searched in a pair.
@@ -37,15 +37,15 @@ struct EvidenceMatches {
 };
 
 struct Evidence {
-    float* values;   // (M, kEvidenceValues)
+    float* values;    // (M, kEvidenceValues)
     float* curve[2];  // (M, kEvidenceCurves, width)
-    float* start;    // (M) px, the first disparity of the curves
-    float* offset;   // (M) px
+    float* start;     // (M) px, the first disparity of the curves
+    float* offset;    // (M) px
     std::int64_t width;
 };
 
 // Throws std::bad_alloc.
-void window_evidence(const EvidencePair* pairs, std::int64_t num_pairs, const EvidenceMatches& matches,
-                     int num_threads, const Evidence& result, Vectors vectors = Vectors::kBest);
+void window_evidence(const EvidencePair* pairs, std::int64_t num_pairs, const EvidenceMatches& matches, int num_threads,
+                     const Evidence& result, Vectors vectors = Vectors::kBest);
 
 }  // namespace tensor_stereo

@@ -25,9 +25,9 @@ struct SearchKeypoints {
     std::int64_t num_predictions;
 };
 
-// Disparity (T) in px, to a fraction, of the least mean of the log SSDs of pixels like the middle and near it, among the
-// whole ones at most near_px from a prediction; of equal ones the least. found (T): whether such a place lies in view 1.
-// Throws std::bad_alloc.
+// Disparity (T) in px, to a fraction, of the least mean of the log SSDs of pixels like the middle and near it, among
+// the whole ones at most near_px from a prediction; of equal ones the least. found (T): whether such a place lies in
+// view 1. Throws std::bad_alloc.
 void window_search(const SearchPair* pairs, std::int64_t num_pairs, const SearchKeypoints& keypoints, float near_px,
                    int num_threads, float* disparity, bool* found, Vectors vectors = Vectors::kBest);
 

@@ -24,6 +24,7 @@ from tensor_stereo.evaluation import errors_against_gt
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.pipeline import Stopwatch, find_matches
 from tensor_stereo.scores import LearnedScore, load_learned, refine_matches, repair_matches, score_matches
+from tensor_stereo.scores.calibration import keep_by_target
 from tensor_stereo.types import Matches
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
@@ -40,6 +41,7 @@ DETECTORS = ("fast", "gftt", "sift")
 NUM_RENDERED = 40
 PRECISIONS = (0.90, 0.95, 0.98)
 TOLERANCE_PX, LIKELY = 1.0, 0.5
+AIM = 0.95  # min_precision
 TWINS = {"disp2.png": "disp6.png", "disp1.png": "disp5.png"}
 
 
@@ -121,6 +123,9 @@ def measure(result: Result, pair: GrayPair, keypoints: torch.Tensor, second: np.
     near = kept & (error <= 2)
     values |= {"kept_error_px": float(error[kept].mean()), "near_error_px": float(error[near].mean())}
     values["kept_precision"] = float(correct[kept].double().mean())
+    if result.is_probability:
+        sure = keep_by_target(result.score, result.score > 0, result.matches.ptr, min_precision=AIM)
+        values["precision_at_aim"] = float(correct[known & sure].double().mean())
     values["bad2"] = float((map_errors(pair, result.matches, result.kept)[1] > BAD_PX).mean())
     values |= epipolar_distances(pair, result.matches, result.kept)
     _, is_hidden = visible_of(pair, result.matches.keypoints0.double(), second)

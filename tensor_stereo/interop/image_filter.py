@@ -115,7 +115,7 @@ def filter_pairs(matches: Matches, pairs: Sequence[PairImages], run: MatchFilter
     """
     if not pairs:
         return filter_matches(matches, run), None
-    items = zip(matches.ptr.tolist(), split_matches(matches), pairs, strict=False)
+    items = zip(matches.ptr[:-1].tolist(), split_matches(matches), pairs, strict=True)
     verdicts, improved = [], []
     for start, verdict, better in filter_stream(items, run):
         verdicts.append(verdict)

@@ -209,6 +209,8 @@ def test_databases_get_rows_of_keypoints_and_descriptors(
         rows = np.stack([np.arange(len(right))] * 2, 1).astype(np.uint32)
         database.write_matches(1, 2, rows)
         database.write_two_view_geometry(1, 2, pycolmap.TwoViewGeometry())
+        database.write_image(pycolmap.Image(name="left/bare.png", camera_id=camera))  # without keypoints and matches
+        database.write_matches(1, 3, np.zeros((0, 2), np.uint32))
     with closing(sqlite3.connect(source)) as raw, raw:  # descriptors of two bytes, which tell their row
         columns = [row[1] for row in raw.execute("PRAGMA table_info(descriptors)")]
         for image, own in ((1, left), (2, right)):
@@ -216,6 +218,7 @@ def test_databases_get_rows_of_keypoints_and_descriptors(
             values = {"image_id": image, "rows": len(own), "cols": 2, "data": data, "type": 1}
             marks = ", ".join("?" * len(columns))
             raw.execute(f"INSERT INTO descriptors VALUES ({marks})", [values[name] for name in columns])
+    (folder / "left/bare.png").write_bytes((folder / IMAGES[0]).read_bytes())
     summary = filter_file(source, out, images=folder, repair=True, refine=True)
     _, better = direct(points, keypoints0=torch.from_numpy(points[0]))
     kept = better.inlier.numpy()
@@ -230,12 +233,14 @@ def test_databases_get_rows_of_keypoints_and_descriptors(
         count, data = raw.execute("SELECT rows, data FROM descriptors WHERE image_id = 2").fetchone()
         assert count == len(two)
         np.testing.assert_array_equal(np.frombuffer(data, np.uint16)[rows[:, 1]], rows[:, 0])
-        stored, origin, score = raw.execute("SELECT rows, origin, score FROM tensor_stereo_improved").fetchone()
+        stored, origin, score = raw.execute(
+            "SELECT rows, origin, score FROM tensor_stereo_improved ORDER BY rows DESC"
+        ).fetchone()
         assert stored == len(rows)
         np.testing.assert_array_equal(np.frombuffer(origin, np.uint8), better.origin[kept])  # type: ignore[index]
         np.testing.assert_allclose(np.frombuffer(score, "<f4"), better.score[kept], atol=1e-6)  # type: ignore[index]
         assert raw.execute("SELECT count(*) FROM two_view_geometries").fetchone() == (0,)
-        assert raw.execute("SELECT rows FROM tensor_stereo_verdicts").fetchone() == (len(right),)
+        assert raw.execute("SELECT rows FROM tensor_stereo_verdicts").fetchall() == [(len(right),), (0,)]
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@
 
 #include "dispatch.hpp"
 #include "lanes.hpp"
-#include "tensor_stereo/parallel.hpp"
 #include "window_comparison.hpp"
 #include "window_sampling.hpp"
 
@@ -25,7 +24,6 @@ constexpr float kGood = 0.3f,
 constexpr float kLeastBend = 0.03f;  // of the parabola through three SSDs, of the least one; less is noise
 constexpr float kAlone = 100;        // px, of a rival that there is not
 constexpr float kFarPlace = 1e4f;    // from the first disparity; what lies beyond is told by 5 at most
-constexpr std::int64_t kMatchesAtOnce = 16;
 constexpr Window kCurves[kEvidenceCurves] = {kLike, kTight}, kSlanted[kSlantedWindows] = {kMiddle, kLike};
 
 static_assert(kMaxSearched == kMaxPlaces);
@@ -276,35 +274,22 @@ struct Job {
     std::int64_t num_pairs;
     const EvidenceMatches& matches;
     const Evidence& result;
-};
-
-// The matches from begin to end.
-struct Range {
-    const Job& job;
-    std::int64_t begin, end;
-    Workspace& work;
 
     template <int N>
-    TENSOR_STEREO_INLINE void run() const {
-        const std::int64_t* const ptr = job.matches.ptr;
-        std::int64_t b = std::upper_bound(ptr, ptr + job.num_pairs + 1, begin) - ptr - 1;
-        for (std::int64_t m = begin; m < end; ++m) {
-            while (m >= ptr[b + 1]) ++b;
-            measure<N>(job.pairs[b], job.matches, m, work, job.result);
-        }
-    }
+    TENSOR_STEREO_INLINE void run(std::int64_t b, std::int64_t m, Workspace& work) const;
 };
+
+template <int N>
+TENSOR_STEREO_INLINE void Job::run(std::int64_t b, std::int64_t m, Workspace& work) const {
+    measure<N>(pairs[b], matches, m, work, result);
+}
 
 }  // namespace
 
 void window_evidence(const EvidencePair* pairs, std::int64_t num_pairs, const EvidenceMatches& matches, int num_threads,
                      const Evidence& result, Vectors vectors) {
     const Job job{pairs, num_pairs, matches, result};
-    parallel_for(matches.ptr[num_pairs], kMatchesAtOnce, num_threads, [&] {
-        return [&, work = std::make_unique<Workspace>()](std::int64_t begin, std::int64_t end) mutable {
-            run_with(vectors, Range{job, begin, end, *work});
-        };
-    });
+    run_items(matches.ptr, num_pairs, num_threads, vectors, job, [] { return std::make_unique<Workspace>(); });
 }
 
 }  // namespace tensor_stereo

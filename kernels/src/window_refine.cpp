@@ -7,14 +7,12 @@
 
 #include "dispatch.hpp"
 #include "lanes.hpp"
-#include "tensor_stereo/parallel.hpp"
 #include "window_comparison.hpp"
 #include "window_sampling.hpp"
 
 namespace tensor_stereo {
 namespace {
 
-constexpr std::int64_t kMatchesAtOnce = 16;
 constexpr int kSteps = 4;
 constexpr float kLongest = 0.5f;  // px, of a step
 constexpr float kApart = 0.25f;   // px, of the samples that give the slope of the grey levels
@@ -37,6 +35,9 @@ struct Job {
     const RefineMatches& matches;
     float max_shift;
     const Refined& result;
+
+    template <int N>
+    TENSOR_STEREO_INLINE void run(std::int64_t b, std::int64_t m, Workspace& work) const;
 };
 
 // One match, whose window of view 0 is prepared.
@@ -110,32 +111,17 @@ TENSOR_STEREO_INLINE void refine(const RefinePair& pair, const Job& job, std::in
     job.result.variance[m] = (after + kNoiseVariance) / (bend + 1e-3f) / kNumPixels;
 }
 
-struct Range {
-    const Job& job;
-    std::int64_t begin, end;
-    Workspace& work;
-
-    template <int N>
-    TENSOR_STEREO_INLINE void run() const {
-        const std::int64_t* const ptr = job.matches.ptr;
-        std::int64_t b = std::upper_bound(ptr, ptr + job.num_pairs + 1, begin) - ptr - 1;
-        for (std::int64_t m = begin; m < end; ++m) {
-            while (m >= ptr[b + 1]) ++b;
-            refine<N>(job.pairs[b], job, m, work);
-        }
-    }
-};
+template <int N>
+TENSOR_STEREO_INLINE void Job::run(std::int64_t b, std::int64_t m, Workspace& work) const {
+    refine<N>(pairs[b], *this, m, work);
+}
 
 }  // namespace
 
 void window_refine(const RefinePair* pairs, std::int64_t num_pairs, const RefineMatches& matches, float max_shift,
                    int num_threads, const Refined& result, Vectors vectors) {
     const Job job{pairs, num_pairs, matches, max_shift, result};
-    parallel_for(matches.ptr[num_pairs], kMatchesAtOnce, num_threads, [&] {
-        return [&, work = std::make_unique<Workspace>()](std::int64_t begin, std::int64_t end) mutable {
-            run_with(vectors, Range{job, begin, end, *work});
-        };
-    });
+    run_items(matches.ptr, num_pairs, num_threads, vectors, job, [] { return std::make_unique<Workspace>(); });
 }
 
 }  // namespace tensor_stereo

@@ -8,14 +8,12 @@
 
 #include "dispatch.hpp"
 #include "lanes.hpp"
-#include "tensor_stereo/parallel.hpp"
 #include "window_comparison.hpp"
 #include "window_sampling.hpp"
 
 namespace tensor_stereo {
 namespace {
 
-constexpr std::int64_t kKeypointsAtOnce = 16;
 constexpr float kNowhere = 40;       // log SSD of a place that is not looked at
 constexpr float kLeastBend = 0.03f;  // of the parabola through three SSDs, of the least one; less is noise
 
@@ -44,6 +42,9 @@ struct Job {
     float near_px;
     float* disparity;
     bool* found;
+
+    template <int N>
+    TENSOR_STEREO_INLINE void run(std::int64_t b, std::int64_t t, Workspace& work) const;
 };
 
 template <int N>
@@ -119,21 +120,10 @@ TENSOR_STEREO_INLINE void search_keypoint(const SearchPair& pair, const Job& job
     job.disparity[t] = (greatest - static_cast<float>(best)) + step;
 }
 
-struct Range {
-    const Job& job;
-    std::int64_t begin, end;
-    Workspace& work;
-
-    template <int N>
-    TENSOR_STEREO_INLINE void run() const {
-        const std::int64_t* const ptr = job.keypoints.ptr;
-        std::int64_t b = std::upper_bound(ptr, ptr + job.num_pairs + 1, begin) - ptr - 1;
-        for (std::int64_t t = begin; t < end; ++t) {
-            while (t >= ptr[b + 1]) ++b;
-            search_keypoint<N>(job.pairs[b], job, t, work);
-        }
-    }
-};
+template <int N>
+TENSOR_STEREO_INLINE void Job::run(std::int64_t b, std::int64_t t, Workspace& work) const {
+    search_keypoint<N>(pairs[b], *this, t, work);
+}
 
 }  // namespace
 
@@ -142,12 +132,10 @@ void window_search(const SearchPair* pairs, std::int64_t num_pairs, const Search
     std::int64_t most = 0;
     for (std::int64_t b = 0; b < num_pairs; ++b) most = std::max(most, pairs[b].count);
     const Job job{pairs, num_pairs, keypoints, near_px, disparity, found};
-    parallel_for(keypoints.ptr[num_pairs], kKeypointsAtOnce, num_threads, [&] {
+    run_items(keypoints.ptr, num_pairs, num_threads, vectors, job, [most] {
         auto work = std::make_unique<Workspace>();
         work->reserve(most);
-        return [&, work = std::move(work)](std::int64_t begin, std::int64_t end) mutable {
-            run_with(vectors, Range{job, begin, end, *work});
-        };
+        return work;
     });
 }
 

@@ -39,10 +39,11 @@ class AddedKeypoints(Generic[Image]):
 
     def place(self, image: Image, num_known: int, added: Added[Image]) -> Int:
         """Their rows in an image that has ``num_known`` keypoints in the file."""
-        parts = self._of_image.get(image, [])
+        if not len(added.points):
+            return np.zeros(0, np.int64)
+        parts = self._of_image.setdefault(image, [])
         start = num_known + sum(len(part.points) for part in parts)
-        if len(added.points):
-            self._of_image[image] = [*parts, added]
+        parts.append(added)
         return np.arange(start, start + len(added.points))
 
     def __iter__(self) -> Iterator[tuple[Image, list[Added[Image]]]]:

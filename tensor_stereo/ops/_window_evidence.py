@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.ops.backends import native
-from tensor_stereo.ops.reference_evidence import NUM_CURVES, NUM_VALUES, Sought
+from tensor_stereo.ops.reference_evidence import NUM_CURVES, NUM_VALUES
 from tensor_stereo.ops.reference_evidence import window_evidence as reference
 from tensor_stereo.ops.registration import operator
-from tensor_stereo.ops.samplers import Views
+from tensor_stereo.ops.samplers import Place, Views
 
 
 def _fake(*args: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -72,7 +72,7 @@ def window_evidence(
     kernels = native(backend)
     if kernels is None:
         views = Views(images0, images1, known1, origin, brighter)
-        places = Sought(left, right, along, disparity, across, slope)
+        places = Place(left, right, along, disparity, across, slope)
         return reference(views, places, ptr, first, count, has_rows, rectified, width)
     values, curve0, curve1, start, offset = kernels.window_evidence(
         *Views(images0, images1, known1, origin, brighter).to_numpy(),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tensor_stereo.ops.samplers import Sampler, Views, search_line
+from tensor_stereo.ops.samplers import Place, Sampler, Views, search_line
 from tensor_stereo.ops.windows import (
     LIKE,
     MIDDLE,
@@ -38,24 +38,9 @@ _NUM_PLACES = 2 * NEAR_PX + 1
 NUM_VALUES = 2 * (NUM_WHOLE * (_NUM_PLACES + 7) + 2 * NUM_HALVES + 1 + len(_SLANTED) * (_NUM_PLACES + 3)) + 2
 
 
-class Sought(NamedTuple):
-    """Where the windows of m matches lie; see :class:`tensor_stereo.scores.samplers.Place`."""
-
-    left: Tensor
-    right: Tensor
-    along: Tensor
-    disparity: Tensor
-    across: Tensor
-    slope: Tensor
-
-    def select(self, rows: slice) -> Sought:
-        """Those of some matches."""
-        return Sought(*(values[rows] for values in self))
-
-
 def window_evidence(
     views: Views,
-    places: Sought,
+    places: Place,
     ptr: Tensor,
     first: Tensor,
     count: Tensor,
@@ -89,7 +74,7 @@ class _Found(NamedTuple):
 
 
 def measure_both(
-    looks: Sequence[Sampler], places: Sought, first: int, count: int, width: int, *, has_rows: bool
+    looks: Sequence[Sampler], places: Place, first: int, count: int, width: int, *, has_rows: bool
 ) -> tuple[Tensor, ...]:
     """Values, both curves, the first disparity and the offset of m matches of one pair."""
     points = places.left, places.right

@@ -11,6 +11,36 @@ from torch import Tensor
 from tensor_stereo.ops.windows import RADIUS_PX, sample_frames, sample_slanted, sample_strips, sample_windows
 
 
+class Place(NamedTuple):
+    """Where the windows of m matches lie, and where their partners are looked for.
+
+    Attributes:
+        left: (m, 2) float32 px of view 0.
+        right: (m, 2) float32 px of view 1; of the frame of view 0 in pairs that are not rectified.
+        along: (m, 2) float32 unit vectors along the epipolar lines, (1, 0) in rectified pairs.
+        disparity: (m,) float32 px, by how much the match lies back along its line.
+        across: (m,) float32 px, how far from the keypoint in view 0 its line in view 1 lies, across it.
+        slope: (m, 2) float32 px/px, of the disparity along and across the line.
+    """
+
+    left: Tensor
+    right: Tensor
+    along: Tensor
+    disparity: Tensor
+    across: Tensor
+    slope: Tensor
+
+    def select(self, rows: slice | Tensor) -> Place:
+        """Those of some matches."""
+        return Place(*(values[rows] for values in self))
+
+    @property
+    def off_line(self) -> Tensor:
+        """(m,) px, how far the partner lies from its line, across it."""
+        x, y = (self.right - self.left).unbind(1)
+        return self.along[:, 0] * y - self.along[:, 1] * x - self.across
+
+
 class RowSampler(NamedTuple):
     """An image (H, W) that is looked at along its rows."""
 

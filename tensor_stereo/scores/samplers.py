@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import to_gray
-from tensor_stereo.ops.samplers import LineSampler, RowSampler, Sampler
+from tensor_stereo.ops.samplers import LineSampler, Place, RowSampler, Sampler
 from tensor_stereo.ops.windows import RADIUS_PX
 from tensor_stereo.scores.alignment.form import Alignment, epipolar_frames, map_points, turn_vectors
 from tensor_stereo.types import Matches
@@ -22,35 +22,6 @@ _LEAST_BLUR_PX = 0.2  # less is none
 _WIDEST = 1.0  # of the size of view 0, how far view 1 may lie beyond it
 _MARGIN = 2 * RADIUS_PX  # px around what is known
 _ROWS_AT_ONCE = 256
-
-
-class Place(NamedTuple):
-    """Where the windows of m matches lie, and where their partners are looked for.
-
-    Attributes:
-        left: (m, 2) float32 px of view 0.
-        right: (m, 2) float32 px of view 1; of the frame of view 0 in pairs that are not rectified.
-        along: (m, 2) float32 unit vectors along the epipolar lines, (1, 0) in rectified pairs.
-        disparity: (m,) float32 px, by how much the match lies back along its line.
-        across: (m,) float32 px, how far from the keypoint in view 0 its line in view 1 lies, across it.
-        slope: (m, 2) float32 px/px, of the disparity along and across the line.
-    """
-
-    left: Tensor
-    right: Tensor
-    along: Tensor
-    disparity: Tensor
-    across: Tensor
-    slope: Tensor
-
-    def select(self, rows: slice | Tensor) -> Place:
-        """Those of some matches."""
-        return Place(*(values[rows] for values in self))
-
-    @property
-    def off_line(self) -> Tensor:
-        """(m,) px, how far the partner lies from its line, across it."""
-        return turn_vectors(self.right - self.left, self.along)[:, 1] - self.across
 
 
 def find_places(matches: Matches, aligned: Matches, slope: Tensor, alignment: Alignment) -> Place:

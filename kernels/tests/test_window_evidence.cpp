@@ -7,12 +7,13 @@
 #include "expect.hpp"
 #include "lanes.hpp"
 #include "tensor_stereo/window_evidence.hpp"
+#include "texture.hpp"
 
 namespace ts = tensor_stereo;
 
 namespace {
 
-constexpr std::int64_t kHeight = 40, kWidth = 70, kCount = 21;
+constexpr std::int64_t kCount = 21;
 
 struct Found {
     std::vector<float> values, curve0, curve1, start, offset;
@@ -21,33 +22,24 @@ struct Found {
 // A random texture, the same 6 px to the left, and matches at every place, also outside; with NaN and huge coordinates.
 Found measure(ts::Vectors vectors, int num_threads, bool is_rectified) {
     std::mt19937 random(0);
-    std::vector<std::uint8_t> left(kHeight * kWidth), right(left.size());
-    for (auto& level : left) level = static_cast<std::uint8_t>(random() % 256);
-    for (std::int64_t k = 0; k < kHeight * kWidth; ++k) right[k] = left[std::min<std::int64_t>(k + 6, left.size() - 1)];
-    const std::vector<char> known(left.size(), 1);
+    const Texture texture;
     std::vector<float> points0, points1, along, disparity, across, slope;
     for (int m = 0; m < 90; ++m) {
         const float x = static_cast<float>(random() % 100) - 12, y = static_cast<float>(random() % 60) - 9;
-        const float strange[] = {NAN, 1e30f, -1e30f, INFINITY};
         points0.insert(points0.end(), {x, y});
-        points1.insert(points1.end(), {m < 4 ? strange[m] : x - 6.25f, y});
+        points1.insert(points1.end(), {m < 4 ? kStrange[m] : x - 6.25f, y});
         along.insert(along.end(), {is_rectified ? 1.0f : 0.8f, is_rectified ? 0.0f : 0.6f});
-        disparity.push_back(m < 4 ? strange[m] : 6.25f);
+        disparity.push_back(m < 4 ? kStrange[m] : 6.25f);
         across.push_back(0.1f);
         slope.insert(slope.end(), {0.4f, -0.5f});
     }
     const auto count = static_cast<std::int64_t>(disparity.size());
     const std::int64_t ptr[] = {0, count};
     ts::EvidencePair pair;
-    for (int v = 0; v < 2; ++v) {
-        pair.view[v].levels = v == 0 ? left.data() : right.data();
-        pair.view[v].height = kHeight;
-        pair.view[v].width = kWidth;
-    }
+    texture.show(pair.view);
     pair.first = -3;
     pair.count = kCount;
     pair.is_rectified = is_rectified;
-    if (!is_rectified) pair.view[1].known = reinterpret_cast<const bool*>(known.data());
     Found found;
     found.values.resize(count * ts::kEvidenceValues);
     found.curve0.resize(count * ts::kEvidenceCurves * kCount);

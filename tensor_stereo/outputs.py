@@ -111,9 +111,8 @@ class FilterOutput:
         """
         flat, graphs = self._flat(), self._graphs()
         alignment = self._known_alignment(graphs)
-        moved = refine_matches(
-            self.matches, images0, images1, flat.inlier, alignment, graphs, max_shift_px=max_shift_px
-        )
+        options: Any = {"max_shift_px": max_shift_px, "backend": self._settings.backend}
+        moved = refine_matches(self.matches, images0, images1, flat.inlier, alignment, graphs, **options)
         origin = torch.zeros_like(flat.relation) if self.origin is None else self.origin
         return replace(flat, matches=moved, origin=mark_refined(self.matches, moved, origin))
 
@@ -140,7 +139,8 @@ class FilterOutput:
         if self.judge is None:
             raise ValueError("judge must be the filter that decided, got None")
         kept, alignment = self._flat().inlier, self._known_alignment()
-        found = repair_matches(self.matches, images0, images1, kept, alignment, keypoints0=keypoints0, ptr0=ptr0)
+        options: Any = {"keypoints0": keypoints0, "ptr0": ptr0, "backend": self._settings.backend}
+        found = repair_matches(self.matches, images0, images1, kept, alignment, **options)
         is_shown = self.judge.config.resolved_score == "learned"
         output = self.judge(found.matches, **({"images0": images0, "images1": images1} if is_shown else {}))
         return replace(output, rows=found.rows, origin=found.origin)  # type: ignore[no-any-return]

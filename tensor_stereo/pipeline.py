@@ -274,7 +274,13 @@ def improve_pairs(gray: Sequence[ImagePair], judged: Judged, keypoints: Features
     if config.repair:
         kept, alignment = judged.verdict.inlier, _known_alignment(judged, config)
         more = repair_matches(
-            judged.matches, *views, kept, alignment, keypoints0=keypoints.keypoints, ptr0=keypoints.ptr
+            judged.matches,
+            *views,
+            kept,
+            alignment,
+            keypoints0=keypoints.keypoints,
+            ptr0=keypoints.ptr,
+            backend=config.backend,
         )
         matches = group_pairs(gray, more.matches, config, Stopwatch()) if config.constrained else more.matches
         graphs = build_match_graphs(matches, tie_tolerance=config.tie_tolerance, backend=config.backend)
@@ -283,7 +289,7 @@ def improve_pairs(gray: Sequence[ImagePair], judged: Judged, keypoints: Features
         judged = judged._replace(origin=more.origin)
     if config.refine:
         kept, alignment = judged.verdict.inlier, _known_alignment(judged, config)
-        moved = refine_matches(judged.matches, *views, kept, alignment, judged.graphs)
+        moved = refine_matches(judged.matches, *views, kept, alignment, judged.graphs, backend=config.backend)
         judged = judged._replace(matches=moved, origin=mark_refined(judged.matches, moved, judged.origin))
     return judged
 

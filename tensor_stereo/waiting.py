@@ -22,6 +22,11 @@ def wait_passively() -> None:
             os.environ.setdefault(name, value)
 
 
+def chosen_policy() -> dict[str, str]:
+    """The variables of processes elsewhere: as the user of this one has chosen, or passive."""
+    return {name: os.environ.get(name, value) for name, value in POLICY.items()}
+
+
 @contextmanager
 def passive_children() -> Iterator[None]:
     """Let the threads of processes that start here wait without spinning, unless their user has chosen.

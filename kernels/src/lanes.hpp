@@ -1,7 +1,8 @@
 // Several floats at a time, and functions of them whose bits do not depend on the instruction set.
 //
-// Everything here is inlined into functions that are compiled for several instruction sets. No product and sum are
-// contracted, and no function of the C library takes part, whose last bits may depend on the machine.
+// (The learned network alone contracts products and sums.) Everything here is inlined into functions that are compiled
+// for several instruction sets. No product and sum are contracted, and no function of the C library takes part, whose
+// last bits may depend on the machine.
 #pragma once
 
 #include <cmath>

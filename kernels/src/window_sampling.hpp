@@ -29,6 +29,12 @@ TENSOR_STEREO_INLINE float bounded(float x) {
     return x > -kFar ? (x < kFar ? x : kFar) : -kFar;
 }
 
+// Of the offsets of a sheared window, which reach no farther than that.
+constexpr float kReachPx = 60;
+TENSOR_STEREO_INLINE float within_reach(float x) {
+    return x > -kReachPx ? (x < kReachPx ? x : kReachPx) : -kReachPx;  // also of what is no number
+}
+
 // The axes in which the windows of a match lie: the step from column to column and from row to row.
 struct Axes {
     Place along, across;
@@ -90,7 +96,8 @@ TENSOR_STEREO_INLINE void sample_frame(const GrayImage& image, Place center, con
             const auto ahead = static_cast<float>(first + k);
             const float dx = fraction_x + ahead * axes.along.x + down * axes.across.x;
             const float dy = fraction_y + ahead * axes.along.y + down * axes.across.y;
-            const float u = std::max(std::min(dx, most_x), least_x), v = std::max(std::min(dy, most_y), least_y);
+            // In this order what is no number becomes the least.
+            const float u = std::max(least_x, std::min(most_x, dx)), v = std::max(least_y, std::min(most_y, dy));
             const float u0 = std::floor(u), v0 = std::floor(v);
             const float fu = u - u0, fv = v - v0;
             const auto x = std::clamp<std::int64_t>(column + static_cast<std::int64_t>(u0), 0, image.width - 1);
@@ -128,8 +135,8 @@ TENSOR_STEREO_INLINE void sample_sheared(const GrayImage& image, Place center, f
         const auto reach = static_cast<float>(radius);
         const float shift = fraction_x + down * shear_y, stretch = 1 + shear_x;
         const float one = shift - reach * stretch, other = shift + reach * stretch;
-        const int low = static_cast<int>(std::clamp(std::min(one, other), -60.0f, 60.0f)) - 1;
-        const int high = static_cast<int>(std::clamp(std::max(one, other), -60.0f, 60.0f)) + 2;
+        const int low = static_cast<int>(within_reach(std::min(one, other))) - 1;
+        const int high = static_cast<int>(within_reach(std::max(one, other))) + 2;
         const bool is_inside = column + low >= 0 && column + high < image.width;
         for (int x = low; x <= high; ++x) {
             const auto from = is_inside ? column + x : std::clamp<std::int64_t>(column + x, 0, image.width - 1);
@@ -138,8 +145,8 @@ TENSOR_STEREO_INLINE void sample_sheared(const GrayImage& image, Place center, f
         }
         float* const row = strip.row[y];
         for (int k = 0; k < width; ++k) {
-            const float dx = shift + static_cast<float>(k - radius) * stretch;
-            const int at = static_cast<int>(std::clamp(dx, -60.0f, 60.0f) + kReach) - kReach;  // rounds down
+            const float dx = within_reach(shift + static_cast<float>(k - radius) * stretch);
+            const int at = static_cast<int>(dx + kReach) - kReach;  // rounds down
             const float fu = dx - static_cast<float>(at);
             const float* const from = between + at + kReach;
             row[k] = (from[0] * (1 - fu) + from[1] * fu) - image.brighter;

@@ -109,7 +109,10 @@ def rows_of(points: Float, keypoints: Float) -> Int:
 def extend_rows(values: Array, added: Array) -> Array:
     """The array with more rows behind it, in a type that holds both.
 
-    Half precision, which has no fractions beyond 1024, becomes single.
+    Half precision, which has no fractions beyond 1024, becomes single, and so do whole numbers.
+
+    >>> extend_rows(np.array([[1, 2]]), np.array([[3.5, 4.0]])).tolist()
+    [[1.0, 2.0], [3.5, 4.0]]
     """
-    dtype = np.float32 if values.dtype == np.float16 else values.dtype
+    dtype = values.dtype if values.dtype in (np.float32, np.float64) else np.dtype(np.float32)
     return np.concatenate([values.astype(dtype), added.astype(dtype)])

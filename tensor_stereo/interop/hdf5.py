@@ -137,6 +137,27 @@ def find_exported(source: Path, file: Any) -> list[str]:
 
 def read(place: str, group: Any, name: str, kinds: str, ndim: int) -> Array:
     """A dataset (N,), (N, 2) or (2, N) of plain numbers, after a look at its form, its size and where its data lies."""
+    dataset = _find(place, group, name)
+    kind = _kind_of(place, dataset, name)
+    if kind not in kinds:
+        raise ValueError(
+            f"{place}: {name!r} must hold {'numbers' if 'f' in kinds else 'integers'}, got {dataset.dtype}"
+        )
+    shape = dataset.shape
+    if shape is None or len(shape) != ndim or (ndim == 2 and 2 not in shape):
+        raise ValueError(f"{place}: {name!r} must have shape {'(N, 2)' if ndim == 2 else '(N,)'}, got {shape}")
+    return _read_checked(place, dataset, name)
+
+
+def read_numbers(place: str, group: Any, name: str) -> Array:
+    """A dataset of plain numbers of any shape, after the same look."""
+    dataset = _find(place, group, name)
+    if _kind_of(place, dataset, name) not in "fiub" or dataset.shape is None:
+        raise ValueError(f"{place}: {name!r} must hold numbers, got {dataset.dtype}")
+    return _read_checked(place, dataset, name)
+
+
+def _find(place: str, group: Any, name: str) -> Any:
     import h5py
 
     dataset = member(place, group, name)
@@ -144,16 +165,19 @@ def read(place: str, group: Any, name: str, kinds: str, ndim: int) -> Array:
         raise ValueError(f"{place} has no dataset {name!r}")
     if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
         raise ValueError(f"{place}: {name!r} must be a dataset with its data in this file")
+    return dataset
+
+
+def _kind_of(place: str, dataset: Any, name: str) -> str:
     try:
-        dtype = dataset.dtype
+        return str(dataset.dtype.kind)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{place}: the type of {name!r} is unknown: {error}") from error
-    if dtype.kind not in kinds:
-        raise ValueError(f"{place}: {name!r} must hold {'numbers' if 'f' in kinds else 'integers'}, got {dtype}")
+
+
+def _read_checked(place: str, dataset: Any, name: str) -> Array:
     shape = dataset.shape
-    if shape is None or len(shape) != ndim or (ndim == 2 and 2 not in shape):
-        raise ValueError(f"{place}: {name!r} must have shape {'(N, 2)' if ndim == 2 else '(N,)'}, got {shape}")
-    if max(*shape, math.prod(dataset.chunks or ())) > MAX_ROWS:
+    if max(*shape, 0, math.prod(dataset.chunks or ())) > MAX_ROWS:
         raise ValueError(
             f"{place}: {name!r} must have at most {MAX_ROWS} rows, got {max(shape)} in chunks of {dataset.chunks}"
         )

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from tensor_stereo.interop.added_keypoints import Added, AddedKeypoints, extend_rows
-from tensor_stereo.interop.hdf5 import Copy, has, open_file, reading
+from tensor_stereo.interop.hdf5 import Copy, has, open_file, read_numbers, reading
 from tensor_stereo.interop.verdicts import Array
 
 
 def append_keypoints(source: Path, target: Path, added: AddedKeypoints[str]) -> None:
     """Copy a file of keypoints and add more to some images.
 
-    In a group of hloc every other dataset with as many rows, or columns as its descriptors, grows by the values of the
-    keypoints that the new ones were matched with.
+    In a group of hloc its descriptors, scores, scales and orientations grow by the values of the keypoints that the new
+    ones were matched with. DISK keeps descriptors and scores in files of their own, which stay as they are.
 
     Args:
         source: The file.
@@ -38,35 +38,45 @@ def append_keypoints(source: Path, target: Path, added: AddedKeypoints[str]) -> 
         copy.check(source)
 
 
+# What extractors of hloc store of a keypoint, and the axis of the keypoints.
+_OF_KEYPOINTS = {"descriptors": 1, "scores": 0, "keypoint_scores": 0, "scales": 0, "oris": 0, "orientations": 0}
+
+
 def _append(source: Path, file: Any, path: str, parts: list[Added[str]]) -> None:
-    points = file[path][()]
+    points = file[path][()]  # which was checked when it was read
     folder, _, name = path.rpartition("/")
     if name == "keypoints" and folder:  # a group of hloc
-        for other in [one for one in file[folder] if one != name and has(source, file[folder], one)]:
-            _extend_like(file, f"{folder}/{other}", len(points), parts)
+        for other, axis in _OF_KEYPOINTS.items():
+            if has(source, file[folder], other):
+                _extend_like(source, file, f"{folder}/{other}", axis, len(points), parts)
     _replace(file, path, extend_rows(points, np.concatenate([part.points for part in parts])))
 
 
-def _extend_like(file: Any, path: str, count: int, parts: list[Added[str]]) -> None:
+def _extend_like(source: Path, file: Any, path: str, axis: int, count: int, parts: list[Added[str]]) -> None:
     """Extend what has a value for each of ``count`` keypoints."""
-    shape = getattr(file[path], "shape", None)
-    if not shape or count not in shape:
+    values = _read(source, file, path)
+    if values.ndim <= axis or values.shape[axis] != count:
         return
-    axis = len(shape) - 1 if shape[-1] == count else 0  # hloc's descriptors are (D, N)
-    if shape[axis] != count:
-        return
-    values = np.moveaxis(file[path][()], axis, 0)
-    name = path.rpartition("/")[2]
-    more = [_take(file, f"{part.partner.rpartition('/')[0]}/{name}", axis, part.rows, values) for part in parts]
+    values, name = np.moveaxis(values, axis, 0), path.rpartition("/")[2]
+    more = [_take(source, file, f"{part.partner.rpartition('/')[0]}/{name}", axis, part.rows, values) for part in parts]
     _replace(file, path, np.moveaxis(np.concatenate([values, *more]), 0, axis))
 
 
-def _take(file: Any, path: str, axis: int, rows: Array, like: Array) -> Array:
+def _take(source: Path, file: Any, path: str, axis: int, rows: Array, like: Array) -> Array:
     """The values of the partners; zeros where there are none of this form."""
-    values = np.moveaxis(file[path][()], axis, 0) if path in file and file[path].ndim == like.ndim else like[:0]
+    folder, _, name = path.rpartition("/")
+    values = like[:0]
+    if has(source, file[folder], name) and file[path].ndim == like.ndim:
+        values = np.moveaxis(_read(source, file, path), axis, 0)
     if values.shape[1:] != like.shape[1:] or len(values) <= rows.max(initial=-1):
         return np.zeros((len(rows), *like.shape[1:]), like.dtype)
     return values[rows].astype(like.dtype)
+
+
+def _read(source: Path, file: Any, path: str) -> Array:
+    """A dataset of plain numbers with its data in the file, of a size that was checked."""
+    folder, _, name = path.rpartition("/")
+    return read_numbers(f"{source}, {folder!r}", file[folder], name)
 
 
 def _replace(file: Any, path: str, values: Array) -> None:

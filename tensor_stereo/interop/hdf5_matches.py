@@ -29,6 +29,7 @@ from tensor_stereo.interop.image_filter import ImageFilter, PairImages, filter_s
 from tensor_stereo.interop.index_arrays import Indices, index_matches
 from tensor_stereo.interop.result_names import ResultNames, free_name, name_results
 from tensor_stereo.interop.verdicts import Array, FilterSummary, Improved, MatchFilter, Verdicts
+from tensor_stereo.scores import Origin
 from tensor_stereo.types import Matches
 
 _NOTE = "putative_results"  # attribute with the names of the results
@@ -283,6 +284,8 @@ def _write_group(group: Any, found: _Found, verdicts: Verdicts, better: _Better 
         attributes = dict(group["matches0"].attrs)
         del group["matches0"]
         group.create_dataset("matches0", data=partner).attrs.update(attributes)
+        if "matching_scores0" in group:
+            _spread_scores(group, better, len(partner))
     for name, values in {"putative_matches0": found.stored, **results}.items():
         group.create_dataset(name, data=values)
     group["putative_matches0"].attrs[_NOTE] = list(results)
@@ -295,6 +298,21 @@ def _write_group(group: Any, found: _Found, verdicts: Verdicts, better: _Better 
         rows0, rows1 = indices.rows0[rejected], indices.rows1[rejected]
         partner[rows1[partner[rows1] == rows0]] = -1
         group["matches1"][...] = partner
+
+
+def _spread_scores(group: Any, better: _Better, size: int) -> None:
+    """Give repaired matches the score of the filter in the place of the matcher's, and every keypoint a value."""
+    old = group["matching_scores0"]
+    scores = np.zeros(size, old.dtype)
+    scores[: len(old)] = old[()]
+    again = better.origin == int(Origin.REPAIRED)
+    if better.score is not None:
+        scores[better.rows.rows0[again]] = better.score[again]
+    attributes = dict(old.attrs)
+    if "putative_matching_scores0" not in group:
+        group.create_dataset("putative_matching_scores0", data=old[()])
+    del group["matching_scores0"]
+    group.create_dataset("matching_scores0", data=scores).attrs.update(attributes)
 
 
 def _improved_results(better: _Better, size: int | None, taken: set[str]) -> dict[str, Any]:
@@ -339,7 +357,8 @@ def _replace_dataset(file: Any, found: _Found, verdicts: Verdicts, better: _Bett
     if better is not None:
         results |= _improved_results(better, None, {*attributes, *results})
         rows = np.stack([better.rows.rows0, better.rows.rows1], axis=1 if found.in_rows else 0)
-        left = rows.astype(np.promote_types(stored.dtype, np.int32))
+        fits = rows.max(initial=0) <= np.iinfo(stored.dtype).max
+        left = rows.astype(stored.dtype if fits else np.int64)
     attributes |= {"putative_matches": stored, **results, _NOTE: list(results)}
     del file[found.pair.path]
     dataset = file.create_dataset(found.pair.path, data=left)

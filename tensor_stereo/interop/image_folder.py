@@ -53,4 +53,7 @@ class ImageFolder:
         path = Path(name)
         if path.is_absolute() or ".." in path.parts or not path.parts:
             raise ValueError(f"images must be named by paths below {self.root}, got {name!r}")
+        if not (self.root / path).is_file():  # DISK leaves endings out
+            beside = [one for one in (self.root / path.parent).glob("*") if one.stem == path.name and one.is_file()]
+            path = path.with_name(beside[0].name) if len(beside) == 1 else path
         return read_image(self.root / path)

@@ -17,6 +17,7 @@ from tensor_stereo.interop.match_tables import filter_table
 from tensor_stereo.interop.npz import filter_npz
 from tensor_stereo.interop.verdicts import FilterSummary, MatchFilter, RectifiedCount
 from tensor_stereo.modules import DelaunayFilter
+from tensor_stereo.paths import check_apart, prepare_target
 
 
 def filter_file(
@@ -99,7 +100,15 @@ def filter_file(
     elif repair or refine:
         raise ValueError(f"images must be the folder of the images for {'repair' if repair else 'refine'}, got None")
     needs_keypoints = ending == ".h5" and keypoints is not None and (repair or refine)
-    with whole_file(keypoints_beside(out)) if needs_keypoints else nullcontext() as more, whole_file(out) as target:
+    if needs_keypoints:
+        check_apart(
+            "out, whose keypoints go into a file beside it,",
+            keypoints_beside(out),
+            {"source": source, "keypoints": keypoints},
+        )
+        prepare_target("out", keypoints_beside(out))
+    # the last to be opened is the first to be in place: the keypoints that the matches name
+    with whole_file(out) as target, whole_file(keypoints_beside(out)) if needs_keypoints else nullcontext() as more:
         summary = _filter(ending, source, target, run, keypoints, score_name, more)
     return replace(summary, num_rectified=run.num_rectified)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from tensor_stereo.atomic import append_line, drop_torn_line, whole_file
 from tensor_stereo.configs import FileFilterConfig, FilterConfig
+from tensor_stereo.interop.formats import keypoints_beside
 from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.match_lists import JOURNAL_FILE, SETTINGS_FILE, MatchFile, find_match_files
 from tensor_stereo.interop.verdicts import FilterSummary
@@ -62,7 +63,8 @@ def filter_files(
         keypoints: File of keypoints for the ``.h5`` files of hloc or DISK, which hold none.
         score_name: Name of the score, as in :func:`~tensor_stereo.filter_file`. Not for ``.h5`` and ``.db``.
         config: Settings of verdict and score, as in :func:`~tensor_stereo.filter_file`.
-        images: Folder of the images of all files, as in :func:`~tensor_stereo.filter_file`.
+        images: Folder of the images of all files, as in :func:`~tensor_stereo.filter_file`. Whether an image has
+            changed nobody asks when a call goes on.
         repair: Search rejected matches again, as there.
         refine: Move kept matches, as there.
         on_progress: Called after each file with the number of files done, their total and the name of the file.
@@ -86,7 +88,7 @@ def filter_files(
     """
     source, out = Path(source), Path(out)
     files = find_match_files(source, out, None if keypoints is None else Path(keypoints))
-    looks = {"images": None if images is None else str(images), "repair": repair, "refine": refine}
+    looks = {"images": None if images is None else str(Path(images).absolute()), "repair": repair, "refine": refine}
     if images is not None:
         check_folder("images", Path(images))
     settings = {"config": asdict(config or FileFilterConfig()), "score_name": score_name, **looks}
@@ -102,7 +104,7 @@ def filter_files(
         for number, file in enumerate(files):
             result, stamp = out / file.name, _stamp(file)
             entry = known.get(file.name)
-            if entry is not None and entry["stamp"] == stamp and _size(result) == entry["size"]:
+            if entry is not None and entry["stamp"] == stamp and _sizes(result) == entry["size"]:
                 num_found += 1
                 total += FilterSummary(**entry["summary"])
             else:
@@ -113,10 +115,11 @@ def filter_files(
                         raise
                     errors[file.name] = " ".join(str(error).split())
                     if entry is not None:  # the result of what the file was
-                        result.unlink(missing_ok=True)
+                        for path in (result, keypoints_beside(result)):
+                            path.unlink(missing_ok=True)
                 else:
                     total += summary
-                    done = {"name": file.name, "stamp": stamp, "size": _size(result), "summary": asdict(summary)}
+                    done = {"name": file.name, "stamp": stamp, "size": _sizes(result), "summary": asdict(summary)}
                     append_line(json.dumps(done, separators=(",", ":")).encode(), journal)
             if on_progress is not None:
                 on_progress(number + 1, len(files), file.name)
@@ -136,9 +139,13 @@ def _filter_one(
     )
 
 
-def _size(path: Path) -> int | None:
-    """Bytes of a file; None if there is none."""
-    return path.stat().st_size if path.is_file() else None
+def _sizes(path: Path) -> int | list[int] | None:
+    """Bytes of a result, and of its keypoints if there are some; None if there is none."""
+    if not path.is_file():
+        return None
+    beside = keypoints_beside(path)
+    is_pair = has_ending(path, ".h5") and beside.is_file()
+    return [path.stat().st_size, beside.stat().st_size] if is_pair else path.stat().st_size
 
 
 def _stamp(file: MatchFile) -> list[int]:
@@ -155,10 +162,10 @@ def _claim(out: Path, settings: dict[str, Any]) -> None:
     path = out / SETTINGS_FILE
     if path.exists():
         try:
-            known = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+            known = dict(json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
-        if known != settings:
+        if {"images": None, "repair": False, "refine": False} | known != settings:
             raise ValueError(f"out: {out} holds results of other settings, see {path.name}; name another folder")
         return
     with whole_file(path) as part:

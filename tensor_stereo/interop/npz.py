@@ -69,7 +69,7 @@ def filter_npz(source: Path, target: Path, run: MatchFilter, *, score_name: str 
             results: dict[str, Array | None] = dict(zip(names, read_pairs.lay_out(verdicts), strict=True))
             if improved is not None:
                 improved = improved._replace(rows=read_pairs.rows_of(improved.rows))
-                free = (free_name(name, members.keys() - ours) for name in IMPROVED)
+                free = (free_name(name, {*(members.keys() - ours), *names}) for name in IMPROVED)
                 results |= dict(zip(free, improved, strict=True))
             with zipfile.ZipFile(target, "w", kind) as result:
                 for name, (info, _) in members.items():

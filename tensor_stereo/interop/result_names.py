@@ -39,15 +39,21 @@ def earlier_results(names: Sequence[str]) -> Iterator[ResultNames]:
 def later_results(names: Sequence[str], relation: str, improved: Sequence[str]) -> list[str]:
     """The names of improved matches, or those chosen in their place, that stand right behind ``relation``.
 
-    >>> later_results(["x0", "relation", "improved_x1", "z"], "relation", ["improved_x1", "origin"])
-    ['improved_x1']
+    A filter writes them all, but for a score where there is none, one after the other; less is not its work.
+
+    >>> later_results(["x0", "relation", "improved_x1", "origin", "z"], "relation", ["improved_x1", "origin"])
+    ['improved_x1', 'origin']
+    >>> later_results(["x0", "relation", "origin"], "relation", ["improved_x1", "origin"])
+    []
     """
-    found = []
-    for name in names[names.index(relation) + 1 :]:
-        if not any(re.fullmatch(rf"(filter_)?{ours}(_\d+)?", name) for ours in improved):
-            break
-        found.append(name)
-    return found
+    behind = names[names.index(relation) + 1 :]
+    for ours in (improved, [name for name in improved if not name.endswith("score")]):
+        own = behind[: len(ours)]
+        if len(own) == len(ours) and all(
+            re.fullmatch(rf"(filter_)?{one}(_\d+)?", name) for one, name in zip(ours, own, strict=True)
+        ):
+            return list(own)
+    return []
 
 
 def free_name(name: str, taken: Collection[str]) -> str:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -81,8 +80,6 @@ class LearnedScore(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("calibration", torch.tensor([1.0, 0.0]).repeat(NUM_TOLERANCES, 1))
-        self.has_native_size = (width, edge_width, num_rounds) == (_WIDTH, _EDGE_WIDTH, _ROUNDS)
-        self.packed: tuple[Any, Tensor] | None = None  # by pack_weights
 
     def forward(
         self,
@@ -107,7 +104,7 @@ class LearnedScore(nn.Module):
         """
         with torch.autocast(matches.keypoints0.device.type, enabled=False):
             backend = "auto" if config is None else config.backend
-            if runs_natively(self, matches, backend):
+            if runs_natively(self, matches, backend, evidence):
                 logit = infer_natively(self, matches, graphs, evidence, alignment)
                 return logit, self.calibrate(logit)
             logit, _ = self.infer(measure_quantities(matches, graphs, evidence, config, alignment))
@@ -131,6 +128,15 @@ class LearnedScore(nn.Module):
             beliefs.append(belief)
         whole = self.head_whole(_pair_mean(state, q)).index_select(0, q.batch)
         return _cumulative(self.last((self.head(state) + whole).relu())), beliefs
+
+    def is_plain(self) -> bool:
+        """Whether it has the size that the kernel knows, and nothing of it is replaced, hooked or parametrized."""
+        known = {LearnedScore, MessageRound, nn.Linear, nn.ReLU, nn.Sequential, nn.ModuleList, nn.LayerNorm}
+        for module in self.modules():
+            if type(module) not in known or module._forward_hooks or module._forward_pre_hooks:
+                return False
+        rounds = [messages.edge.out_features for messages in self.rounds]  # type: ignore[union-attr]
+        return self.head.out_features == _WIDTH and rounds == [_EDGE_WIDTH] * _ROUNDS
 
     def calibrate(self, logit: Tensor) -> Tensor:
         """(M, 5) probability; logistic regression on the logits (Platt 1999), fitted on scenes left out of training."""
@@ -330,7 +336,7 @@ def learned_probabilities(
     parts = []
     networks = {kind: _of_kind(network, matches, rectified=kind) for kind in set(kinds)}
     backend = "auto" if config is None else config.backend
-    is_native = all(runs_natively(one, matches, backend) for one in networks.values())
+    is_native = all(runs_natively(one, matches, backend, evidence) for one in networks.values())
     limit = matches.num_matches if is_native else _MATCHES_AT_ONCE
     for (first, last), part, own, seen in _parts(matches, graphs, evidence, kinds, limit):
         shared = None if alignment is None else alignment.select(first, last)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
+from torch.nn import Parameter
 
 from tensor_stereo.configs import Backend
 from tensor_stereo.graphs import MatchGraphs
@@ -23,19 +25,24 @@ if TYPE_CHECKING:
 _SCALED = ("nodes", "cost", "image", "edges", "edge_image")
 
 
-def runs_natively(network: LearnedScore, matches: Matches, backend: Backend) -> bool:
-    """Whether the kernel computes that network for these matches: not where a gradient is asked for.
+def runs_natively(
+    network: LearnedScore, matches: Matches, backend: Backend, evidence: ImageEvidence | None = None
+) -> bool:
+    """Whether the kernel computes that network for these matches: not where a gradient or a tangent is asked for.
 
     >>> from tensor_stereo.scores.learned import load_learned
     >>> points = torch.rand(9, 2).requires_grad_()
     >>> runs_natively(load_learned(), Matches(points, points, torch.tensor([0, 9])), "auto")
     False
     """
-    if torch.compiler.is_compiling() or native(backend) is None or not network.has_native_size:
+    if torch.compiler.is_compiling() or native(backend) is None or not network.is_plain():
         return False
-    given = (matches.keypoints0, matches.keypoints1, *network.parameters())
-    wants_gradient = torch.is_grad_enabled() and any(values.requires_grad for values in given)
-    return not wants_gradient and all(values.is_cpu for values in given)
+    given = (matches.keypoints0, matches.keypoints1, *network.parameters(), *(() if evidence is None else evidence))
+    if any(type(values) not in (Tensor, Parameter) or not values.is_cpu for values in given):
+        return False
+    if any(forward_ad.unpack_dual(values).tangent is not None for values in given[:2]):  # type: ignore[no-untyped-call]
+        return False
+    return not (torch.is_grad_enabled() and any(values.requires_grad for values in given))
 
 
 def infer_natively(
@@ -64,7 +71,7 @@ def infer_natively(
     seen: tuple[Any, ...] = (None,) * 6
     if evidence is not None:
         order = ("values", "curve0", "curve1", "first", "num_columns", "offset")
-        seen = tuple(getattr(evidence, name).contiguous().numpy() for name in order)
+        seen = tuple(getattr(evidence, name).detach().contiguous().numpy() for name in order)
     logits = kernels.learned_network(
         pack_weights(network).numpy(),
         matches.ptr.numpy(),
@@ -80,12 +87,8 @@ def infer_natively(
 
 @torch.no_grad()
 def pack_weights(network: LearnedScore) -> Tensor:
-    """All weights in one row, in the order in which the kernel reads them; packed once for as long as none changes."""
-    parts = _list_weights(network)
-    state = tuple((part.data_ptr(), part._version) for part in parts)
-    if network.packed is None or network.packed[0] != state:
-        network.packed = state, torch.cat([part.detach().float().reshape(-1) for part in parts])
-    return network.packed[1]
+    """All weights in one row, in the order in which the kernel reads them: copied in every call, as they are then."""
+    return torch.cat([part.detach().float().reshape(-1) for part in _list_weights(network)])
 
 
 def _list_weights(network: LearnedScore) -> list[Tensor]:

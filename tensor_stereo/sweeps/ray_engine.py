@@ -15,7 +15,7 @@ from tensor_stereo.configs import SweepConfig
 from tensor_stereo.sweeps.engines import Outcome
 from tensor_stereo.sweeps.plan import Task
 from tensor_stereo.sweeps.units import run_tasks
-from tensor_stereo.waiting import POLICY
+from tensor_stereo.waiting import chosen_policy
 
 
 class RayEngine:
@@ -44,7 +44,7 @@ class RayEngine:
             ray.init(address=address or "local", log_to_driver=False, configure_logging=False, **local)
         self.num_workers = num_workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._config = ray.put(config)
-        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": POLICY})(run_tasks)
+        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": chosen_policy()})(run_tasks)
         self._running: dict[Any, tuple[Task, ...]] = {}
 
     def submit(self, tasks: Sequence[Task]) -> None:

@@ -290,3 +290,61 @@ def test_folders_of_files_share_the_images(tmp_path: Path, folder: Path, named: 
     assert json.loads((out / "filter.json").read_text())["repair"] is True
     with pytest.raises(ValueError, match="holds results of other settings"):
         filter_files(tmp_path, out, images=folder)
+
+
+def test_columns_of_the_user_behind_earlier_results_stay(tmp_path: Path, folder: Path, named: Path) -> None:
+    out, again = tmp_path / "out.csv", tmp_path / "again.csv"
+    filter_file(named, out)
+    pl.read_csv(out).with_columns(origin=pl.lit("cam A")).write_csv(out)
+    filter_file(out, again, images=folder, repair=True)
+    found = pl.read_csv(again)
+    assert set(found["origin"]) == {"cam A"}
+    assert set(found["filter_origin"]) == {"given", "repaired"}
+
+
+def test_keypoints_beside_a_result_replace_nothing_that_is_read(
+    tmp_path: Path, folder: Path, points: tuple[np.ndarray, np.ndarray]
+) -> None:
+    arguments = write_hdf5(tmp_path, points, disk=False)
+    keypoints = arguments["keypoints"].rename(tmp_path / "out.keypoints.h5")
+    before = keypoints.read_bytes()
+    with pytest.raises(
+        ValueError, match="out, whose keypoints go into a file beside it, must be another file than key"
+    ):
+        filter_file(tmp_path / "in.h5", tmp_path / "out.h5", keypoints=keypoints, images=folder, refine=True)
+    assert keypoints.read_bytes() == before
+
+
+def test_whole_keypoints_become_fractions_and_scores_follow(
+    tmp_path: Path, folder: Path, points: tuple[np.ndarray, np.ndarray]
+) -> None:
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed")
+    arguments = write_hdf5(tmp_path, points, disk=False)
+    name0, name1 = (name.replace("/", "-") for name in IMAGES)
+    with h5py.File(tmp_path / "in.h5", "r+") as file, h5py.File(arguments["keypoints"], "r+") as features:
+        file[f"{name0}/{name1}/matching_scores0"] = np.full(len(points[1]), 0.25, np.float16)
+        for name, values in zip(IMAGES, points, strict=True):
+            del features[f"{name}/keypoints"]
+            features[f"{name}/keypoints"] = values.astype(np.int32)
+    filter_file(**arguments, images=folder, repair=True, refine=True)
+    with h5py.File(tmp_path / "out.h5") as file, h5py.File(tmp_path / "out.keypoints.h5") as features:
+        right = features[f"{IMAGES[1]}/keypoints"][()]
+        assert right.dtype == np.float32
+        assert (right[len(points[1]) :] % 1 != 0).any()
+        group = file[f"{name0}/{name1}"]
+        assert len(group["matching_scores0"]) == len(group["matches0"]) == len(points[0])
+        repaired = group["origin"][()] == Origin.REPAIRED
+        assert (group["matching_scores0"][()][repaired] >= 0.5).all()
+        np.testing.assert_array_equal(group["putative_matching_scores0"], np.full(len(points[1]), 0.25))
+    again = {"keypoints": tmp_path / "out.keypoints.h5", "images": folder}
+    filter_file(tmp_path / "out.h5", tmp_path / "again.h5", **again, refine=True)
+
+
+def test_results_of_calls_without_images_go_on(tmp_path: Path, named: Path) -> None:
+    out = tmp_path / "out"
+    filter_files(tmp_path, out)
+    settings = json.loads((out / "filter.json").read_text())
+    for name in ("images", "repair", "refine"):  # as an earlier version wrote it
+        del settings[name]
+    (out / "filter.json").write_text(json.dumps(settings))
+    assert filter_files(tmp_path, out).num_found == 1

@@ -90,6 +90,18 @@ def test_a_batch_is_its_pairs_one_by_one(monkeypatch: pytest.MonkeyPatch) -> Non
             assert torch.equal(one, other[rows])
 
 
+@needs_native
+def test_slopes_and_places_that_are_no_numbers_are_read_inside_of_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    for rectified in (True, False):
+        arguments = arguments_of(monkeypatch, (0,), rectified=rectified)
+        slope, left, along = (arguments[k].clone() for k in (10, 5, 7))
+        slope[:5] = torch.tensor([[torch.nan, 0], [2, 0], [-2, 0], [torch.inf, 1], [0, -torch.inf]])
+        left[5], along[6] = torch.nan, torch.nan
+        arguments[10], arguments[5], arguments[7] = slope, left, along
+        values = window_evidence(*arguments, "native")[0]
+        assert values[7:].isfinite().all()
+
+
 @pytest.mark.parametrize("backend", installed_backends())
 def test_operator_keeps_the_rules_of_torch(monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
     arguments = arguments_of(monkeypatch, (0,), rectified=True)

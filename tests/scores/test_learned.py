@@ -112,7 +112,7 @@ def test_score_tells_correct_from_wrong_better_with_images() -> None:
     for evidence in (None, evidence_of(matches, pair)):
         score = score_learned(matches, build_match_graphs(matches), evidence)
         areas.append(float((score[correct][:, None] > score[~correct]).float().mean()))
-    assert 0.85 < areas[0] < areas[1]
+    assert 0.8 < areas[0] < areas[1]
 
 
 def test_gradients_are_finite() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
@@ -91,17 +92,38 @@ def test_a_batch_is_its_pairs_one_by_one_whatever_the_threads() -> None:
         assert torch.equal(both(select_pairs(matches, b, b + 1))[0], whole[start:stop])
 
 
-def test_changed_weights_are_packed_anew() -> None:
+def test_weights_count_as_they_are_in_each_call() -> None:
     matches = random_pairs(7, (40,))
     network = LearnedScore().requires_grad_(False).eval()
     network.load_state_dict(load_learned().state_dict())
     before = both(matches, network=network)
-    packed = pack_weights(network)
-    assert pack_weights(network) is packed
-    network.last.bias.add_(1)
+    network.last.bias.data.add_(1)  # which no version of a tensor counts
     after = both(matches, network=network)
     assert_alike(after)
     assert (before[0] - after[0]).abs().max() > 0.5
+    with torch.inference_mode():
+        assert_alike(both(matches, network=copy.deepcopy(network)))
+
+
+def test_hooks_run_in_torch() -> None:
+    matches = random_pairs(7, (40,))
+    network = copy.deepcopy(load_learned())
+    network.last.register_forward_hook(lambda module, given, found: 0 * found)
+    assert not runs_natively(network, matches, "native")
+    assert_alike(both(matches, network=network))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script:DeprecationWarning")  # of torch's own forward mode
+def test_tangents_and_gradients_of_evidence_stay_with_torch() -> None:
+    matches = random_pairs(7, (40,))
+    seen = evidence_of(matches)
+    seen = seen._replace(values=seen.values.clone().requires_grad_())
+    logit, _ = load_learned()(matches, build_match_graphs(matches), seen)
+    logit.sum().backward()
+    assert seen.values.grad is not None
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(matches.keypoints1, torch.ones_like(matches.keypoints1))
+        assert not runs_natively(load_learned(), replace(matches, keypoints1=dual), "native")
 
 
 def test_the_kernel_leaves_gradients_and_other_networks_to_torch() -> None:

@@ -3,7 +3,7 @@
 
 namespace tensor_stereo {
 
-// All give the same bits.
+// All give the same bits, but for the last digits of the learned network.
 enum class Vectors { kBest, kBaseline, kAvx2, kAvx512 };
 
 // Whether this machine has them.

@@ -53,6 +53,7 @@ class ImageFilter:
     def __init__(self, run: DelaunayFilter, images: ImageFolder, *, repair: bool, refine: bool) -> None:
         self.images = images
         self._run, self._repair, self._refine = run, repair, refine
+        self.improves = repair or refine
         self.num_rectified = 0
 
     def __call__(self, matches: Matches) -> FilterOutput:
@@ -79,7 +80,7 @@ class ImageFilter:
                 better = better.refine(*views)
         except (ValueError, FileNotFoundError) as error:
             raise ValueError(f"images {pair.name0!r} and {pair.name1!r}: {error}") from error
-        return to_verdicts(output), to_improved(better) if self._repair or self._refine else None
+        return to_verdicts(output), to_improved(better) if self.improves else None
 
 
 def filter_stream(
@@ -114,7 +115,9 @@ def filter_pairs(matches: Matches, pairs: Sequence[PairImages], run: MatchFilter
         The verdicts, and the improved matches, pair by pair, whose rows are those of the batch.
     """
     if not pairs:
-        return filter_matches(matches, run), None
+        whole = filter_matches(matches, run)
+        improves = isinstance(run, ImageFilter) and run.improves
+        return whole, _no_improved(whole) if improves else None
     items = zip(matches.ptr[:-1].tolist(), split_matches(matches), pairs, strict=True)
     verdicts, improved = [], []
     for start, verdict, better in filter_stream(items, run):
@@ -122,3 +125,10 @@ def filter_pairs(matches: Matches, pairs: Sequence[PairImages], run: MatchFilter
         if better is not None:
             improved.append(better._replace(rows=np.where(better.rows < 0, -1, better.rows + start)))
     return concatenate(Verdicts, verdicts), concatenate(Improved, improved) if improved else None
+
+
+def _no_improved(verdicts: Verdicts) -> Improved:
+    """Of no matches, so that the columns of a result do not depend on its rows."""
+    none = np.zeros((0, 2))
+    inlier, score, relation = verdicts
+    return Improved(none, none, np.zeros(0, np.int64), np.zeros(0, np.int8), inlier, score, relation)

@@ -348,3 +348,11 @@ def test_results_of_calls_without_images_go_on(tmp_path: Path, named: Path) -> N
         del settings[name]
     (out / "filter.json").write_text(json.dumps(settings))
     assert filter_files(tmp_path, out).num_found == 1
+
+
+def test_a_table_without_rows_has_the_same_columns(tmp_path: Path, folder: Path, named: Path) -> None:
+    out, empty = tmp_path / "out.csv", tmp_path / "empty.csv"
+    filter_file(named, out, images=folder, repair=True)
+    pl.read_csv(named)[:0].write_csv(named)
+    filter_file(named, empty, images=folder, repair=True)
+    assert pl.read_csv(empty).columns == pl.read_csv(out).columns

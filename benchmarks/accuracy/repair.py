@@ -23,7 +23,7 @@ from tensor_stereo.dense.semi_global import match_semi_global
 from tensor_stereo.evaluation import errors_against_gt
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.pipeline import Stopwatch, find_matches
-from tensor_stereo.scores import LearnedScore, load_learned, refine_matches, repair_matches, score_matches
+from tensor_stereo.scores import LearnedScore, Origin, load_learned, refine_matches, repair_matches, score_matches
 from tensor_stereo.scores.calibration import keep_by_target
 from tensor_stereo.types import Matches
 
@@ -76,7 +76,7 @@ def run_methods(pair: GrayPair, detector: str, network: LearnedScore) -> tuple[d
         more = repair_matches(matches, *views, kept, given.alignment, keypoints0=keypoints, ptr0=features.ptr)
         anew = score_matches(more.matches, FilterConfig(), images=views, network=network)
         score = torch.where(anew.graphs.group_size > 0, anew.score, 0)
-        repaired = more.origin == 2
+        repaired = more.origin == Origin.REPAIRED
         found[f"{name}, learned, repaired"] = Result(more.matches, score, repaired, is_probability=True)
         finer = refine_matches(more.matches, *views, score >= LIKELY, anew.alignment, anew.graphs)
         found[f"{name}, learned, repaired and refined"] = Result(finer, score, repaired, is_probability=True)

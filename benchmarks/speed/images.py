@@ -33,7 +33,7 @@ from tensor_stereo.types import Matches
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.harness import Suite
 from shared.points import matched_batch
-from shared.scenes import EIGHT, GATES, read_pairs
+from shared.scenes import GATES, read_eight, read_pairs
 from speed.pipeline import naive
 
 Views = list[tuple[torch.Tensor, torch.Tensor]]
@@ -138,16 +138,17 @@ def compare_bare(suite: Suite) -> None:
 @torch.inference_mode()
 def main() -> None:
     suite = Suite("images")
-    found = read_pairs(suite.options.data / "middlebury", EIGHT)
+    source, found = read_eight(suite.options.data)
     pairs = [(to_gray(p.image0[None])[0], to_gray(p.image1[None])[0]) for p in found]
     arrays = [(a[0].numpy(), b[0].numpy()) for a, b in pairs]
-    compare_pipelines(suite, "eight scenes", pairs, arrays)
+    compare_pipelines(suite, source, pairs, arrays)
     config = PipelineConfig(detector="fast")
     matches = match_pairs(to_gray_pairs(pairs), config, Stopwatch())
-    compare_evidence(suite, "eight scenes, FAST", pairs, matches)
-    kitti = read_pairs(suite.options.data / "kitti2015", None)[:1]
-    views = [(to_gray(p.image0[None])[0], to_gray(p.image1[None])[0]) for p in kitti]
-    compare_grid(suite, views, [(a[0].numpy(), b[0].numpy()) for a, b in views])
+    compare_evidence(suite, f"{source}, FAST", pairs, matches)
+    if suite.options.data is not None:
+        kitti = read_pairs(suite.options.data / "kitti2015")[:1]
+        views = [(to_gray(p.image0[None])[0], to_gray(p.image1[None])[0]) for p in kitti]
+        compare_grid(suite, views, [(a[0].numpy(), b[0].numpy()) for a, b in views])
     compare_bare(suite)
     seconds = run_pipeline(pairs, config).seconds
     suite.note("stages of learned in ms per pair", **{k: 1e3 * v / len(pairs) for k, v in seconds.items()})

@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 
 from tensor_stereo.configs import PipelineConfig
-from tensor_stereo.datasets import SyntheticDataset
 from tensor_stereo.features import to_gray
 from tensor_stereo.pipeline import run_pipeline
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.harness import Suite
-from shared.scenes import EIGHT, GATES, read_pairs
+from shared.scenes import GATES, read_eight
 from speed.python_sets import classify_with_sets
 
 
@@ -44,10 +43,7 @@ def naive(images: list[tuple[np.ndarray, np.ndarray]]) -> None:
 
 def main() -> None:
     suite = Suite("pipeline")
-    if suite.options.data is None:
-        source, pairs = "8 synthetic pairs", list(SyntheticDataset(8))
-    else:
-        source, pairs = "eight scenes", read_pairs(suite.options.data / "middlebury", EIGHT)
+    source, pairs = read_eight(suite.options.data)
     tensors = [(to_gray(p.image0[None])[0], to_gray(p.image1[None])[0]) for p in pairs]
     arrays = [(a[0].numpy(), b[0].numpy()) for a, b in tensors]
     plain = PipelineConfig(detector="fast", verdict="cardinality")  # as the peer: no score

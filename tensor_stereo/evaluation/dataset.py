@@ -32,9 +32,9 @@ ROW_SCHEMA: dict[str, Any] = {
     "min_disparity_px": pl.Float64,
     "max_disparity_px": pl.Float64,
     **{f"sgbm_{name}": _COLUMN_TYPES[type(value)] for name, value in vars(SGBMConfig()).items()},  # of sgbm, else null
-    "variant": pl.String,
+    "variant": pl.String,  # unconstrained, or constrained: Restriction 3
     "repair": pl.Boolean,
-    "refine": pl.Boolean,  # unconstrained, or constrained: Restriction 3
+    "refine": pl.Boolean,
     "verdict": pl.String,  # score, adjacency or cardinality
     "min_group_size": pl.Int32,
     "tie_tolerance": pl.Float64,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -79,14 +78,10 @@ def window_refine(
         shift, across, variance = (torch.from_numpy(values).to(left.device) for values in results)
         return shift, across, variance
     found = [torch.zeros(len(left), device=left.device) for _ in range(3)]
-    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
-        samplers = views.look(b, along[start:stop], rectified=bool(rectified[b]))
-        for row in range(start, stop, _ROWS_AT_ONCE):
-            rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
-            looks = [sampler.select(slice(rows.start - start, rows.stop - start)) for sampler in samplers]
-            parts = _minimise(looks, left[rows], right[rows], off_line[rows], slope[rows], max_shift_px)
-            for whole, part in zip(found, parts, strict=True):
-                whole[rows] = part
+    for _, rows, looks in views.look_in_parts(along, ptr, rectified, _ROWS_AT_ONCE):
+        parts = _minimise(looks, left[rows], right[rows], off_line[rows], slope[rows], max_shift_px)
+        for whole, part in zip(found, parts, strict=True):
+            whole[rows] = part
     return found[0], found[1], found[2]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -85,15 +84,9 @@ def window_search(
         return disparity, found
     disparity = torch.zeros(len(points), device=points.device)
     found = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
-        samplers = views.look(b, along[start:stop], rectified=bool(rectified[b]))
-        for row in range(start, stop, _ROWS_AT_ONCE):
-            rows = slice(row, min(row + _ROWS_AT_ONCE, stop))
-            looks = [sampler.select(slice(rows.start - start, rows.stop - start)) for sampler in samplers]
-            searched = _search(
-                looks, points[rows], across[rows], predicted[rows], int(first[b]), int(count[b]), near_px
-            )
-            disparity[rows], found[rows] = searched
+    for b, rows, looks in views.look_in_parts(along, ptr, rectified, _ROWS_AT_ONCE):
+        span = int(first[b]), int(count[b])
+        disparity[rows], found[rows] = _search(looks, points[rows], across[rows], predicted[rows], *span, near_px)
     return disparity, found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -52,16 +51,10 @@ def window_evidence(
     none = torch.zeros(0, dtype=torch.float32, device=ptr.device)
     curve = none.reshape(0, NUM_CURVES, width)
     parts: list[tuple[Tensor, ...]] = [(none.reshape(0, NUM_VALUES), curve, curve, none, none)]
-    ranges = zip(first.tolist(), count.tolist(), has_rows.tolist(), rectified.tolist(), strict=True)
-    for b, ((start, stop), (low, num_places, has_own_rows, is_rectified)) in enumerate(
-        zip(pairwise(ptr.tolist()), ranges, strict=True)
-    ):
-        own = places.select(slice(start, stop))
-        samplers = views.look(b, own.along, rectified=is_rectified)
-        for row in range(0, stop - start, _ROWS_AT_ONCE):
-            rows = slice(row, row + _ROWS_AT_ONCE)
-            looks = [sampler.select(rows) for sampler in samplers]
-            parts.append(measure_both(looks, own.select(rows), low, num_places, width, has_rows=has_own_rows))
+    ranges = list(zip(first.tolist(), count.tolist(), has_rows.tolist(), strict=True))
+    for b, rows, looks in views.look_in_parts(places.along, ptr, rectified, _ROWS_AT_ONCE):
+        low, num_places, has_own_rows = ranges[b]
+        parts.append(measure_both(looks, places.select(rows), low, num_places, width, has_rows=has_own_rows))
     return tuple(torch.cat(part) for part in zip(*parts, strict=True))  # type: ignore[return-value]
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -173,3 +174,13 @@ class Views(NamedTuple):
         known0 = torch.ones_like(image0, dtype=torch.bool)
         none = torch.zeros_like(self.origin[b])
         return LineSampler(image0, none, along, known0), LineSampler(image1, self.origin[b], along, self.known1[b])
+
+    def look_in_parts(
+        self, along: Tensor, ptr: Tensor, rectified: Tensor, rows_at_once: int
+    ) -> Iterator[tuple[int, slice, list[Sampler]]]:
+        """The pair, the rows and how both views are looked at, for some rows of one pair at a time."""
+        for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
+            samplers = self.look(b, along[start:stop], rectified=bool(rectified[b]))
+            for row in range(start, stop, rows_at_once):
+                rows = slice(row, min(row + rows_at_once, stop))
+                yield b, rows, [sampler.select(slice(row - start, rows.stop - start)) for sampler in samplers]

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from tensor_stereo.batching import ptr_to_batch
 from tensor_stereo.features import to_gray
-from tensor_stereo.ops.samplers import LineSampler, Place, RowSampler, Sampler
+from tensor_stereo.ops.samplers import Place
 from tensor_stereo.ops.windows import RADIUS_PX
 from tensor_stereo.scores.alignment.form import Alignment, epipolar_frames, map_points, turn_vectors
 from tensor_stereo.types import Matches
@@ -61,17 +61,6 @@ class PairViews(NamedTuple):
     origin: Tensor
     known1: Tensor | None
 
-    def look(self, along: Tensor) -> tuple[Sampler, Sampler]:
-        """How both are looked at, along the lines (m, 2) of the matches where they are not rectified."""
-        image0, image1 = self.image0.float(), self.image1.float() - self.brighter
-        if self.known1 is None:
-            return RowSampler(image0), RowSampler(image1)
-        known0 = torch.ones_like(image0, dtype=torch.bool)
-        return (
-            LineSampler(image0, torch.zeros_like(self.origin), along, known0),
-            LineSampler(image1, self.origin, along, self.known1),
-        )
-
 
 def prepare_views(views: Sequence[Sequence[Tensor]], matches: Matches, alignment: Alignment) -> Iterator[PairViews]:
     """Both views of each pair, view 1 in the frame of view 0 unless they are rectified.
@@ -105,16 +94,6 @@ def list_views(
         torch.stack([pair.origin for pair in pairs]) if pairs else torch.zeros(0, 2, device=device),
         torch.tensor([pair.brighter for pair in pairs], dtype=torch.float32, device=device),
     )
-
-
-def look_at_pairs(
-    views: Sequence[Sequence[Tensor]], matches: Matches, places: Place, alignment: Alignment
-) -> Iterator[tuple[tuple[Sampler, Sampler], Place]]:
-    """How both views of each pair are looked at, and the places of its matches; arguments as before."""
-    ranges = pairwise(matches.ptr.tolist())
-    for (start, stop), pair in zip(ranges, prepare_views(views, matches, alignment), strict=True):
-        own = places.select(slice(start, stop))
-        yield pair.look(own.along), own
 
 
 def _brighter(gray: Sequence[Tensor], points0: Tensor, points1: Tensor) -> float:

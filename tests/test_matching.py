@@ -16,7 +16,7 @@ from tensor_stereo import matching
 from tensor_stereo.batching import concatenate_features
 from tensor_stereo.configs import MatchingConfig, PipelineConfig
 from tensor_stereo.matching import MatchIndices
-from tensor_stereo.ops import reference
+from tensor_stereo.ops import reference_ssd
 from tensor_stereo.types import Features, Matches
 
 WIDE = {"max_row_offset_px": 1e6}  # a gate that lets everything through: the ragged search instead of the dense one
@@ -248,7 +248,9 @@ def test_bounds_of_gates_are_inside(config: MatchingConfig, inside: list[tuple[f
 def test_candidates_are_the_pairs_inside_the_gates(config: MatchingConfig, grid: float, seed: int) -> None:
     generator = np.random.default_rng(seed)
     views = [make_features(generator, [6, 0, 9], grid=grid) for _ in range(2)]
-    index0, index1 = (torch.cat(rows).numpy() for rows in zip(*reference.gated_candidates(*views, config), strict=True))
+    index0, index1 = (
+        torch.cat(rows).numpy() for rows in zip(*reference_ssd.gated_candidates(*views, config), strict=True)
+    )
     points0, points1 = (view.keypoints.double().numpy() for view in views)
     image = np.arange(15) >= 6
     expected = is_inside(points0, points1, config) & (image[:, None] == image)
@@ -271,11 +273,11 @@ def test_memory_limits_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         for gate in ({}, {"max_row_offset_px": 2.0, "min_disparity_px": 0.0})
     ]
     expected = [match_indices(*pair, config) for pair, config in cases]
-    monkeypatch.setattr(matching, "_CHUNK_DENSE", 64)
-    monkeypatch.setattr(reference, "_CHUNK_VALUES", 7)
-    monkeypatch.setattr(reference, "_CHUNK_CANDIDATES", 11)
+    monkeypatch.setattr(reference_ssd, "_CHUNK_DENSE", 64)
+    monkeypatch.setattr(reference_ssd, "_CHUNK_VALUES", 7)
+    monkeypatch.setattr(reference_ssd, "_CHUNK_CANDIDATES", 11)
     monkeypatch.setenv("TENSOR_STEREO_BACKEND", "scipy")
-    blocks = list(reference.gated_candidates(*views, MatchingConfig(max_row_offset_px=2)))
+    blocks = list(reference_ssd.gated_candidates(*views, MatchingConfig(max_row_offset_px=2)))
     assert len(blocks) > 5
     assert max(len(index0) for index0, _ in blocks) <= 11 + 30
     assert all(same(match_indices(*pair, config), e) for (pair, config), e in zip(cases, expected, strict=True))

@@ -9,7 +9,7 @@
 #include "bindings.hpp"
 #include "tensor_stereo/agreeing_neighbors.hpp"
 #include "tensor_stereo/consensus_belief.hpp"
-#include "tensor_stereo/gated_ssd.hpp"
+#include "tensor_stereo/nearest_ssd.hpp"
 #include "tensor_stereo/one_to_one.hpp"
 #include "tensor_stereo/relate.hpp"
 
@@ -102,8 +102,8 @@ auto one_to_one(Points points0, Points points1, Integers ptr, std::optional<Doub
     return give(std::move(kept), num_matches);
 }
 
-auto gated_ssd(Points keypoints0, Points keypoints1, Matrix descriptors0, Matrix descriptors1, Integers ptr0,
-               Integers ptr1, double row_offset, double min_disparity, double max_disparity, int num_threads) {
+auto nearest_ssd(Points keypoints0, Points keypoints1, Matrix descriptors0, Matrix descriptors1, Integers ptr0,
+                 Integers ptr1, double row_offset, double min_disparity, double max_disparity, int num_threads) {
     const std::size_t num0 = keypoints0.shape(0), num1 = keypoints1.shape(0);
     check(descriptors0.shape(0) == num0 && descriptors1.shape(0) == num1, "descriptors must have one row per keypoint");
     check(descriptors0.shape(1) == descriptors1.shape(1), "descriptors of both views must have one length");
@@ -114,11 +114,11 @@ auto gated_ssd(Points keypoints0, Points keypoints1, Matrix descriptors0, Matrix
     auto index = ts::allocate<std::int64_t>(num0), index1 = ts::allocate<std::int64_t>(num1);
     {
         const nb::gil_scoped_release release;
-        ts::gated_ssd({keypoints0.data(), descriptors0.data(), ptr0.data()},
-                      {keypoints1.data(), descriptors1.data(), ptr1.data()},
-                      static_cast<std::int64_t>(ptr0.shape(0)) - 1, static_cast<std::int64_t>(descriptors0.shape(1)),
-                      {row_offset, min_disparity, max_disparity}, num_threads,
-                      {cost.get(), index.get(), second_cost.get(), cost1.get(), index1.get()});
+        ts::nearest_ssd({keypoints0.data(), descriptors0.data(), ptr0.data()},
+                        {keypoints1.data(), descriptors1.data(), ptr1.data()},
+                        static_cast<std::int64_t>(ptr0.shape(0)) - 1, static_cast<std::int64_t>(descriptors0.shape(1)),
+                        {row_offset, min_disparity, max_disparity}, num_threads, ts::Vectors::kBest,
+                        {cost.get(), index.get(), second_cost.get(), cost1.get(), index1.get()});
     }
     return std::tuple(give(std::move(cost), num0), give(std::move(index), num0), give(std::move(second_cost), num0),
                       give(std::move(cost1), num1), give(std::move(index1), num1));
@@ -139,7 +139,7 @@ void bind_matches(nb::module_& module) {
                nb::arg("slope"), nb::arg("spread"), nb::arg("num_threads"));
     module.def("one_to_one", &one_to_one, nb::arg("points0"), nb::arg("points1"), nb::arg("ptr"),
                nb::arg("cost").none(), nb::arg("num_threads"));
-    module.def("gated_ssd", &gated_ssd, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("descriptors0"),
+    module.def("nearest_ssd", &nearest_ssd, nb::arg("keypoints0"), nb::arg("keypoints1"), nb::arg("descriptors0"),
                nb::arg("descriptors1"), nb::arg("ptr0"), nb::arg("ptr1"), nb::arg("row_offset"),
                nb::arg("min_disparity"), nb::arg("max_disparity"), nb::arg("num_threads"));
 }

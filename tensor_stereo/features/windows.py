@@ -51,18 +51,22 @@ def extract_windows(images: Tensor, keypoints: Tensor, ptr: Tensor, *, window_px
     x, y = nearest.to(torch.int64).unbind(1)
 
     radius = window_px // 2
-    rows, columns = (_mirror(length, radius, images.device) for length in (height, width))
-    padded = images[:, 0].index_select(1, rows).index_select(2, columns)
-    first = (ptr_to_batch(ptr) * len(rows) + y) * len(columns) + x  # its top left pixel
-    num_windows = padded.numel() - 2 * radius * (len(columns) + 1)
-    windows = padded.as_strided((num_windows, window_px, window_px), (1, len(columns), 1))
+    padded = _mirror(_mirror(images[:, 0], 1, radius), 2, radius)
+    stride = width + 2 * radius
+    first = (ptr_to_batch(ptr) * (height + 2 * radius) + y) * stride + x  # its top left pixel
+    num_windows = padded.numel() - 2 * radius * (stride + 1)
+    windows = padded.as_strided((num_windows, window_px, window_px), (1, stride, 1))
     return windows.index_select(0, first).flatten(1).to(torch.float32)
 
 
-def _mirror(size: int, radius: int, device: torch.device) -> Tensor:
-    """(size + 2 radius,) indices of the pixels that a mirrored axis shows, from -radius on."""
-    index = torch.arange(-radius, size + radius, device=device).remainder(2 * size)
-    return torch.minimum(index, 2 * size - 1 - index)
+def _mirror(images: Tensor, axis: int, radius: int) -> Tensor:
+    """The images with ``radius`` more pixels at both ends of an axis, those of a mirror that stands at the border."""
+    while radius > 0:
+        step = min(radius, images.shape[axis])
+        left, right = images.narrow(axis, 0, step), images.narrow(axis, images.shape[axis] - step, step)
+        images = torch.cat([left.flip(axis), images, right.flip(axis)], axis)
+        radius -= step
+    return images.contiguous()
 
 
 def check_window_px(name: str, window_px: int) -> None:

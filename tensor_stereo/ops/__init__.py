@@ -7,7 +7,7 @@ from tensor_stereo.ops._delaunay_graph import match_graphs as match_graphs
 from tensor_stereo.ops._dual_critical_points import dual_critical_points as dual_critical_points
 from tensor_stereo.ops._dual_edge_ratio import dual_edge_ratio as dual_edge_ratio
 from tensor_stereo.ops._dual_edge_ratio import dual_edge_ratio_backward as dual_edge_ratio_backward
-from tensor_stereo.ops._gated_ssd import gated_ssd as gated_ssd
+from tensor_stereo.ops._nearest_ssd import nearest_ssd as nearest_ssd
 from tensor_stereo.ops._predicates import incircle as incircle
 from tensor_stereo.ops._predicates import orientation as orientation
 from tensor_stereo.ops._relate import relate as relate

@@ -1,4 +1,4 @@
-#include "tensor_stereo/gated_ssd.hpp"
+#include "tensor_stereo/nearest_ssd.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -7,6 +7,7 @@
 #include <numeric>
 #include <vector>
 
+#include "dense_ssd.hpp"
 #include "dispatch.hpp"
 #include "lanes.hpp"
 #include "tensor_stereo/parallel.hpp"
@@ -88,6 +89,17 @@ class ImageMatcher {
     std::vector<double> rows_, columns_;
 };
 
+struct Sum {
+    const float *a, *b;
+    std::int64_t size;
+    float& result;
+
+    template <int>
+    TENSOR_STEREO_INLINE void run() const {
+        result = sum_of_squared_differences(a, b, size);
+    }
+};
+
 // The images from begin to end.
 struct Images {
     const FeatureView &view0, &view1;
@@ -102,10 +114,21 @@ struct Images {
     }
 };
 
+bool is_open(const Gate& gate) {
+    constexpr double kInfinity = std::numeric_limits<double>::infinity();
+    return gate.row_offset == kInfinity && gate.min_disparity == -kInfinity && gate.max_disparity == kInfinity;
+}
+
 }  // namespace
 
-void gated_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t num_images, std::int64_t size,
-               const Gate& gate, int num_threads, const Neighbors& result) {
+float ssd_of(const float* a, const float* b, std::int64_t size, Vectors vectors) {
+    float result;
+    run_with(vectors, Sum{a, b, size, result});
+    return result;
+}
+
+void nearest_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t num_images, std::int64_t size,
+                 const Gate& gate, int num_threads, Vectors vectors, const Neighbors& result) {
     constexpr float kInfinity = std::numeric_limits<float>::infinity();
     const std::int64_t num0 = view0.ptr[num_images], num1 = view1.ptr[num_images];
     std::fill_n(result.cost, num0, kInfinity);
@@ -113,9 +136,10 @@ void gated_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t 
     std::fill_n(result.second_cost, num0, kInfinity);
     std::fill_n(result.cost1, num1, kInfinity);
     std::fill_n(result.index1, num1, -1);
+    if (is_open(gate)) return dense_ssd(view0, view1, num_images, size, num_threads, vectors, result);
     parallel_for(num_images, 1, num_threads, [&] {
         return [&, matcher = ImageMatcher()](std::int64_t begin, std::int64_t end) mutable {
-            run_with(Vectors::kBest, Images{view0, view1, begin, end, size, gate, result, matcher});
+            run_with(vectors, Images{view0, view1, begin, end, size, gate, result, matcher});
         };
     });
 }

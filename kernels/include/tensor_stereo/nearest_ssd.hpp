@@ -1,7 +1,9 @@
-// Nearest neighbours by sum of squared differences among the keypoints inside a gate.
+// Nearest neighbours by sum of squared differences among the keypoints inside a gate, or among all.
 #pragma once
 
 #include <cstdint>
+
+#include "tensor_stereo/vectors.hpp"
 
 namespace tensor_stereo {
 
@@ -27,9 +29,10 @@ struct Neighbors {
     std::int64_t* index1;  // (N1)
 };
 
+// Candidates are the keypoints inside the gate; all of them, and no keypoint is looked at, if none of it is closed.
 // The sum runs in 16 interleaved lanes, each in order, which are then added in halves: the same bits as the reference.
 // Throws std::bad_alloc.
-void gated_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t num_images, std::int64_t size,
-               const Gate& gate, int num_threads, const Neighbors& result);
+void nearest_ssd(const FeatureView& view0, const FeatureView& view1, std::int64_t num_images, std::int64_t size,
+                 const Gate& gate, int num_threads, Vectors vectors, const Neighbors& result);
 
 }  // namespace tensor_stereo

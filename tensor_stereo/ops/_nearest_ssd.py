@@ -1,4 +1,4 @@
-"""Operator that finds nearest neighbours by SSD among the keypoints inside a gate."""
+"""Operator that finds nearest neighbours by SSD, among the keypoints inside a gate or among all."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.configs import MatchingConfig
-from tensor_stereo.ops import reference
+from tensor_stereo.ops import reference_ssd
 from tensor_stereo.ops.backends import native
 from tensor_stereo.ops.registration import operator
 from tensor_stereo.types import Features
@@ -23,7 +23,7 @@ def _fake(keypoints0: Tensor, keypoints1: Tensor, *_: object) -> tuple[Tensor, T
 
 
 @operator(_fake)
-def gated_ssd(
+def nearest_ssd(
     keypoints0: Tensor,
     keypoints1: Tensor,
     descriptors0: Tensor,
@@ -38,7 +38,9 @@ def gated_ssd(
     """Nearest neighbours by sum of squared differences; of equal costs the lowest index counts.
 
     Candidates of keypoint i are the keypoints j of the partner image with y1 within y0 +- ``max_row_offset_px`` and x1
-    between x0 - ``max_disparity_px`` and x0 - ``min_disparity_px``, in float64, bounds included.
+    between x0 - ``max_disparity_px`` and x0 - ``min_disparity_px``, in float64, bounds included. With
+    all gates open every keypoint is one, and keypoints need not be finite. Descriptors on another device than the CPU
+    are then compared there, by the reference; otherwise the work is done on the CPU.
 
     Args:
         keypoints0: (N0, 2) px of view 0, finite.
@@ -59,20 +61,22 @@ def gated_ssd(
     Example:
         >>> points, ptr = torch.tensor([[9.0, 4.0], [5.0, 4.0]]), torch.tensor([0, 2])
         >>> windows = torch.tensor([[1.0], [7.0]])
-        >>> gated_ssd(points, points - 2, windows, windows, ptr, ptr, 2.0, 0.0, 3.0, "auto")[1]
+        >>> nearest_ssd(points, points - 2, windows, windows, ptr, ptr, 2.0, 0.0, 3.0, "auto")[1]
         tensor([0, 1])
     """
     kernels = native(backend)
-    if kernels is None:
+    is_open = all(math.isinf(gate) for gate in (max_row_offset_px, min_disparity_px, max_disparity_px))
+    if kernels is None or (is_open and descriptors0.device.type != "cpu"):
         config = MatchingConfig(
             max_row_offset_px=max_row_offset_px, min_disparity_px=min_disparity_px, max_disparity_px=max_disparity_px
         )
         views = ((keypoints0, ptr0, descriptors0), (keypoints1, ptr1, descriptors1))
         features0, features1 = (Features(points, ptr, vectors, points[:, 0]) for points, ptr, vectors in views)
-        return reference.gated_ssd(features0, features1, config)  # type: ignore[return-value]
-    reference.check_coordinates("features0", keypoints0)
-    reference.check_coordinates("features1", keypoints1)
-    results = kernels.gated_ssd(
+        return reference_ssd.nearest_ssd(features0, features1, config)  # type: ignore[return-value]
+    for name, points in (("features0", keypoints0), ("features1", keypoints1)):
+        if not is_open:
+            reference_ssd.check_coordinates(name, points)
+    results = kernels.nearest_ssd(
         *(p.detach().to("cpu", torch.float64).contiguous().numpy() for p in (keypoints0, keypoints1)),
         *(d.detach().to("cpu", torch.float32).contiguous().numpy() for d in (descriptors0, descriptors1)),
         *(ptr.numpy(force=True) for ptr in (ptr0, ptr1)),
@@ -83,17 +87,3 @@ def gated_ssd(
     )
     cost, index, second_cost, cost1, index1 = (torch.from_numpy(values).to(keypoints0.device) for values in results)
     return cost, index, second_cost, cost1, index1
-
-
-def open_gates(config: MatchingConfig) -> tuple[float, float, float]:
-    """Row offset and disparity range in px, with infinities for what is not gated.
-
-    Example:
-        >>> open_gates(MatchingConfig(max_disparity_px=64))
-        (inf, -inf, 64)
-    """
-    return (
-        math.inf if config.max_row_offset_px is None else config.max_row_offset_px,
-        -math.inf if config.min_disparity_px is None else config.min_disparity_px,
-        math.inf if config.max_disparity_px is None else config.max_disparity_px,
-    )

@@ -13,6 +13,7 @@ from torch import Tensor
 from tensor_stereo.batching import lengths_to_ptr
 from tensor_stereo.types import check_tensor
 
+MAX_PIXELS = 2**22  # of an image that is no large one
 S = TypeVar("S")
 T = TypeVar("T")
 
@@ -102,12 +103,14 @@ def map_images(function: Callable[[Tensor], T], images: Tensor, *, max_workers: 
     Args:
         function: takes one (H, W) uint8 image; must be free of side effects.
         images: (B, 1, H, W) uint8.
-        max_workers: number of threads, at most ``torch.get_num_threads()`` (the default).
+        max_workers: number of threads, at most ``torch.get_num_threads()`` (the default). No more than 4 megapixels are
+            worked on at a time, or one image, since a detector may need some hundred bytes for each pixel.
 
     >>> map_images(lambda image: int(image.sum()), torch.ones(2, 1, 3, 4, dtype=torch.uint8))
     [12, 12]
     """
-    return map_threads(function, images[:, 0].unbind(), max_workers=max_workers)
+    at_once = max(1, MAX_PIXELS // (images.shape[-2] * images.shape[-1]))
+    return map_threads(function, images[:, 0].unbind(), max_workers=min(at_once, max_workers or at_once))
 
 
 def map_threads(function: Callable[[S], T], items: Sequence[S], *, max_workers: int | None = None) -> list[T]:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import cv2
 import torch
-from kornia.feature import SIFTFeatureScaleSpace, get_laf_center, laf_is_filled
+from kornia.feature import SIFTFeatureScaleSpace, get_laf_center, get_laf_scale, laf_is_filled
 from torch import Tensor, nn
 
 from tensor_stereo.configs import SIFTConfig
 from tensor_stereo.features.images import join_images, map_images, strongest_first, to_gray
+from tensor_stereo.features.tiles import ScaledFeatures, detect_in_tiles
 from tensor_stereo.types import Features
 
 _SIZE = 128  # 4 x 4 cells of 8 directions
+_LAF_PER_SIGMA = 6  # kornia's frames are so many times as large as the scale of detection
 _OPENCV_NORM = 512  # OpenCV scales the unit vector by this and rounds it to whole numbers 0..255
 
 
@@ -28,6 +33,9 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
     Descriptors are plain SIFT, not RootSIFT, in OpenCV's order of cells and directions from either backend.
     ``upright=True`` skips the orientation: in the eight scenes of the paper it gives 11 % more matches (kornia, ratio
     0.8), and a share of correct ones that is 1.3 percentage points lower. The default is Lowe's method.
+
+    Images of more than 4 megapixels are detected in tiles and, for keypoints of scale 7.2 px and more, at half
+    their size (:func:`tensor_stereo.features.tiles.detect_in_tiles`), so that memory stays below 2 GB.
 
     Images are detected one by one: kornia's operators choose another order of summation for a batch. With kornia, the
     bits (not the result to single precision) also depend on ``torch.get_num_threads()``. No gradient.
@@ -54,7 +62,7 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
     config = config or SIFTConfig()
     gray = to_gray(images)
     if config.backend == "opencv":
-        detected = map_images(lambda image: _detect_opencv(image, config), gray.cpu())
+        detect, workers, gray = partial(_detect_opencv, config=config), None, gray.cpu()
     else:
         module = SIFTFeatureScaleSpace(
             min(config.max_keypoints, 4 * gray.shape[-2] * gray.shape[-1]),  # it makes room for so many
@@ -65,36 +73,43 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
             descriptor_layout="opencv",
         )
         # kornia's operators bring threads of their own; a second image fills the gaps between them
-        detected = map_images(lambda image: _detect_kornia(image, module, config), gray, max_workers=2)
-    (keypoints, descriptors, scores), ptr = join_images(detected, [(2,), (_SIZE,), ()], gray.device)
+        detect, workers = partial(_detect_kornia, module=module), 2
+    detected = map_images(lambda image: _strongest(image, detect, config), gray, max_workers=workers)
+    (keypoints, descriptors, scores), ptr = join_images(detected, [(2,), (_SIZE,), ()], images.device)
     return Features(keypoints, ptr, descriptors, scores)
 
 
-@torch.no_grad()
-def _detect_kornia(image: Tensor, module: nn.Module, config: SIFTConfig) -> tuple[Tensor, Tensor, Tensor]:
+def _strongest(
+    image: Tensor, detect: Callable[[Tensor], ScaledFeatures], config: SIFTConfig
+) -> tuple[Tensor, Tensor, Tensor]:
     """Keypoints (N, 2), descriptors (N, 128), scores (N,) of one (H, W) image."""
-    lafs, responses, descriptors = module(image[None, None].float() / 255)
-    filled = laf_is_filled(lafs)[0]  # the other slots are padding
-    keypoints, scores = get_laf_center(lafs)[0, filled], responses[0, filled]
+    keypoints, descriptors, scores, _ = detect_in_tiles(detect, image)
     order = strongest_first(keypoints, scores, config.max_keypoints)
-    return keypoints[order], descriptors[0, filled][order], scores[order]
+    return keypoints[order], descriptors[order], scores[order]
 
 
-def _detect_opencv(image: Tensor, config: SIFTConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Keypoints (N, 2), descriptors (N, 128), scores (N,) of one (H, W) image on the CPU."""
+@torch.no_grad()
+def _detect_kornia(image: Tensor, module: nn.Module) -> ScaledFeatures:
+    lafs, responses, descriptors = module(image[None, None] / 255)
+    filled = laf_is_filled(lafs)  # the other slots are padding
+    sigma = get_laf_scale(lafs)[..., 0, 0] / _LAF_PER_SIGMA
+    return ScaledFeatures(get_laf_center(lafs)[filled], descriptors[filled], responses[filled], sigma[filled])
+
+
+def _detect_opencv(image: Tensor, config: SIFTConfig) -> ScaledFeatures:
+    levels = image.round().to(torch.uint8).numpy()
     sift = cv2.SIFT.create(config.max_keypoints, enable_precise_upscale=True)
     if config.upright:
-        places = {(*k.pt, k.size): k for k in sift.detect(image.numpy())}  # one keypoint for all orientations
+        places = {(*k.pt, k.size): k for k in sift.detect(levels)}  # one keypoint for all orientations
         for keypoint in places.values():
             keypoint.angle = 0
         # without keypoints, OpenCV's compute() raises for images of some sizes
-        found, vectors = sift.compute(image.numpy(), list(places.values())) if places else ([], None)
+        found, vectors = sift.compute(levels, list(places.values())) if places else ([], None)
     else:
-        found, vectors = sift.detectAndCompute(image.numpy(), None)
+        found, vectors = sift.detectAndCompute(levels, None)
     if not found:
         nothing = torch.zeros(0, dtype=torch.float32)
-        return nothing.reshape(0, 2), nothing.reshape(0, _SIZE), nothing
+        return ScaledFeatures(nothing.reshape(0, 2), nothing.reshape(0, _SIZE), nothing, nothing)
     keypoints = torch.from_numpy(cv2.KeyPoint.convert(found))
-    scores = torch.tensor([keypoint.response for keypoint in found], dtype=torch.float32)
-    order = strongest_first(keypoints, scores, config.max_keypoints)
-    return keypoints[order], torch.from_numpy(vectors)[order] / _OPENCV_NORM, scores[order]
+    scores, size = torch.tensor([(k.response, k.size) for k in found], dtype=torch.float32).unbind(1)
+    return ScaledFeatures(keypoints, torch.from_numpy(vectors) / _OPENCV_NORM, scores, size / 2)

@@ -2,12 +2,14 @@
 
 #include <cmath>
 #include <cstdlib>
+#include <limits>
 
 namespace tensor_stereo {
 
 void CriticalPoints::prepare(const Triangulation& mesh, const GraphEdges& edges) {
     mesh_ = &mesh;
     edges_ = &edges;
+    has_search_ = false;
     const auto count = static_cast<Index>(mesh.vertex.size());
     rank_.resize(count);
     for (Index v = 0; v < count; ++v) rank_[mesh.vertex[v]] = v;
@@ -125,7 +127,8 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
     right_.start(first_right, twin[h], look(first_right));
     left_.start(first_left, twin[previous_in_triangle(h)], look(first_left));
     h = twin[next_in_triangle(h)];
-    while (true) {  // the segment enters a triangle through h, which runs from the left chain to the right one
+    for (Index steps = 0;; ++steps) {  // the segment enters a triangle through h, from the left chain to the right one
+        if (steps == max_steps_) return search(i, j);
         if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return kBlockedLink;
         const Index to_left = previous_in_triangle(h), to_right = next_in_triangle(h);
         const Index apex = origin[to_left];
@@ -147,6 +150,24 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
         }
     }
     const Critical found{first_of_best(j, i, right_), first_of_best(i, j, left_), false};
+    return is_out_of_reach(i, j, found.right, found.left) ? kBlockedLink : found;
+}
+
+// The same by a search among all points.
+Critical CriticalPoints::search(Index i, Index j) {
+    if (!has_search_) search_.build(mesh_->points, mesh_->bounds);
+    has_search_ = true;
+    const Point* const p = mesh_->points.data();
+    const Index left = search_.find_left(i, j, -std::numeric_limits<double>::infinity());
+    if (left == kBlocked) return kBlockedLink;
+    double enough = -std::numeric_limits<double>::infinity();
+    if (left != kNone) {
+        const double end = dual_end(p[i], p[j], p[left]), error = end - least_dual_end(p[i], p[j], p[left]);
+        enough = -(1 + 1e-9) * reach(i, j) - (end + error);
+    }
+    const Critical found{search_.find_left(j, i, enough), left, false};
+    if (found.right == kBlocked) return kBlockedLink;
+    if (found.left == kNone || found.right == kNone) return found;
     return is_out_of_reach(i, j, found.right, found.left) ? kBlockedLink : found;
 }
 

@@ -7,6 +7,7 @@
 
 #include "tensor_stereo/graph_edges.hpp"
 #include "tensor_stereo/index.hpp"
+#include "tensor_stereo/point_search.hpp"
 #include "tensor_stereo/predicates.hpp"
 #include "tensor_stereo/triangulation.hpp"
 
@@ -48,9 +49,10 @@ inline constexpr Critical kBlockedLink{kBlocked, kBlocked, false};
 // Finds them for links between points of one segment. If {i, j} is an edge of the mesh they are its opposite vertices;
 // otherwise they are among the vertices of the triangles that the segment from i to j crosses, since the constrained
 // Delaunay triangulation with that segment only changes these (Anglada, Computers & Graphics 21 (1997), section 3).
+// After so many triangles all points are searched instead, by boxes.
 class CriticalPoints {
    public:
-    explicit CriticalPoints(Reach reach) : reach_(reach) {}
+    explicit CriticalPoints(Reach reach, Index max_steps = 48) : reach_(reach), max_steps_(max_steps) {}
 
     // Both must live on and stay as they are.
     void prepare(const Triangulation& mesh, const GraphEdges& edges);
@@ -103,6 +105,7 @@ class CriticalPoints {
     Critical find_in_mesh(Index i, Index j);
     Critical between(Index h) const;
     Critical walk(Index i, Index j, Index h);
+    Critical search(Index i, Index j);
     void add(Chain& chain, Index i, Index j, Index vertex, Index beyond, const End& end) const;
     Index first_of_best(Index i, Index j, const Chain& chain) const;
     Index first_of_polygon(Index h, Index first) const;
@@ -120,6 +123,9 @@ class CriticalPoints {
     }
 
     Reach reach_;
+    Index max_steps_;
+    PointSearch search_;
+    bool has_search_ = false;  // search_ is that of these points
     const Triangulation* mesh_ = nullptr;
     const GraphEdges* edges_ = nullptr;
     std::vector<Index> fan_;  // of each vertex the half-edge from it that comes first counter-clockwise

@@ -124,33 +124,45 @@ Critical CriticalPoints::walk(Index i, Index j, Index h) {
         return {value, 1.1e-15 * inverse * size * (size + (1 + 2 * std::fabs(value)) * span)};
     };
     const Index first_right = origin[next_in_triangle(h)], first_left = origin[previous_in_triangle(h)];
-    right_.start(first_right, twin[h], look(first_right));
-    left_.start(first_left, twin[previous_in_triangle(h)], look(first_left));
+    chains_[kRight].start(first_right, twin[h], look(first_right));
+    chains_[kLeft].start(first_left, twin[previous_in_triangle(h)], look(first_left));
     h = twin[next_in_triangle(h)];
     for (Index steps = 0;; ++steps) {  // the segment enters a triangle through h, from the left chain to the right one
+        if (chains_[kLeft].best_end.above() + chains_[kRight].best_end.above() < out_of_reach) return kBlockedLink;
         if (steps == max_steps_) return search(i, j);
-        if (left_.best_end.above() + right_.best_end.above() < out_of_reach) return kBlockedLink;
-        const Index to_left = previous_in_triangle(h), to_right = next_in_triangle(h);
-        const Index apex = origin[to_left];
+        const Index sides[2] = {next_in_triangle(h), previous_in_triangle(h)};  // to the right, to the left
+        const Index apex = origin[sides[kLeft]];
         if (apex == j) {
-            left_.corners.push_back({j, twin[to_left]});
-            right_.corners.push_back({j, twin[to_right]});
+            for (int side = 0; side < 2; ++side) chains_[side].push(j, twin[sides[side]]);
             break;
         }
-        const End apex_end = look(apex);
-        int side = sign(cross);
-        if (std::fabs(cross) <= mesh_->bounds.orientation) side = turn(i, j, apex);
-        if (side == 0) return kBlockedLink;
-        if (side > 0) {
-            add(left_, i, j, apex, twin[to_left], apex_end);
-            h = twin[to_right];
-        } else {
-            add(right_, i, j, apex, twin[to_right], apex_end);
-            h = twin[to_left];
-        }
+        const End end = look(apex);
+        int turned = sign(cross);
+        if (std::fabs(cross) <= mesh_->bounds.orientation) turned = turn(i, j, apex);
+        if (turned == 0) return kBlockedLink;
+        // Which side it is, is as good as random: no branch depends on it.
+        const int side = turned > 0 ? kLeft : kRight;
+        Chain& chain = chains_[side];
+        const double gain = chain.best_end.value - end.value;
+        int inside = sign(gain);
+        if (!(std::fabs(gain) > chain.best_end.error + end.error)) inside = is_inside(side, i, j, chain, apex);
+        chain.best = inside > 0 ? chain.size : chain.best;
+        chain.best_end.value = inside > 0 ? end.value : chain.best_end.value;
+        chain.best_end.error = inside > 0 ? end.error : chain.best_end.error;
+        chain.any_tie = inside > 0 ? false : (inside == 0) | chain.any_tie;
+        chain.push(apex, twin[sides[side]]);
+        h = twin[sides[1 - side]];
     }
-    const Critical found{first_of_best(j, i, right_), first_of_best(i, j, left_), false};
+    const Critical found{first_of_best(j, i, chains_[kRight]), first_of_best(i, j, chains_[kLeft]), false};
     return is_out_of_reach(i, j, found.right, found.left) ? kBlockedLink : found;
+}
+
+// The sign of how far a vertex lies inside the circle of the best on its side; rounding decides nothing.
+int CriticalPoints::is_inside(int side, Index i, Index j, const Chain& chain, Index vertex) const noexcept {
+    const Point* const p = mesh_->points.data();
+    const Index best = chain.corners[chain.best].vertex;
+    return side == kLeft ? incircle(p[i], p[j], p[best], p[vertex], mesh_->bounds)
+                         : incircle(p[j], p[i], p[best], p[vertex], mesh_->bounds);
 }
 
 // The same by a search among all points.
@@ -171,36 +183,15 @@ Critical CriticalPoints::search(Index i, Index j) {
     return is_out_of_reach(i, j, found.right, found.left) ? kBlockedLink : found;
 }
 
-// Appends to the left or the right chain; rounding decides nothing.
-void CriticalPoints::add(Chain& chain, Index i, Index j, Index vertex, Index beyond, const End& end) const {
-    const bool is_left = &chain == &left_;
-    const double gain = chain.best_end.value - end.value;
-    int inside = sign(gain);
-    if (!(std::fabs(gain) > chain.best_end.error + end.error)) {
-        const Point* const p = mesh_->points.data();
-        const Index best = chain.corners[chain.best].vertex;
-        inside = is_left ? incircle(p[i], p[j], p[best], p[vertex], mesh_->bounds)
-                         : incircle(p[j], p[i], p[best], p[vertex], mesh_->bounds);
-    }
-    chain.corners.push_back({vertex, beyond});
-    if (inside > 0) {
-        chain.best = chain.corners.size() - 1;
-        chain.best_end = end;
-        chain.any_tie = false;
-    } else if (inside == 0) {
-        chain.any_tie = true;
-    }
-}
-
 // Of the best vertices of a chain on the left of i -> j, and of all others on their circle, the first.
 Index CriticalPoints::first_of_best(Index i, Index j, const Chain& chain) const {
     const Point* const p = mesh_->points.data();
-    const std::size_t last = chain.corners.size() - 1;  // an end of the segment
+    const Index last = chain.size - 1;  // an end of the segment
     const Index apex = chain.corners[chain.best].vertex;
     const auto is_on_circle = [&](Index v) { return incircle(p[i], p[j], p[apex], p[v], mesh_->bounds) == 0; };
     Index first = apex;
     bool before_on_circle = true;  // the other end of the segment
-    for (std::size_t k = 0; k <= last; ++k) {
+    for (Index k = 0; k <= last; ++k) {
         const auto [v, beyond] = chain.corners[k];
         const bool on_circle = k == chain.best || k == last || (chain.any_tie && is_on_circle(v));
         if (on_circle && k != last && is_before(v, first)) first = v;

@@ -52,7 +52,9 @@ inline constexpr Critical kBlockedLink{kBlocked, kBlocked, false};
 // After so many triangles all points are searched instead, by boxes.
 class CriticalPoints {
    public:
-    explicit CriticalPoints(Reach reach, Index max_steps = 48) : reach_(reach), max_steps_(max_steps) {}
+    static constexpr Index kMaxSteps = 48;
+
+    explicit CriticalPoints(Reach reach, Index max_steps = kMaxSteps) : reach_(reach), max_steps_(max_steps) {}
 
     // Both must live on and stay as they are.
     void prepare(const Triangulation& mesh, const GraphEdges& edges);
@@ -88,25 +90,30 @@ class CriticalPoints {
         };
 
         void start(Index vertex, Index beyond, const End& end) {
-            corners.clear();
+            size = 0;
             best = 0;
             best_end = end;
             any_tie = false;
-            corners.push_back({vertex, beyond});
+            push(vertex, beyond);
         }
 
-        std::vector<Corner> corners;
-        std::size_t best;  // sees the segment under the largest angle
-        End best_end;      // its dual end
-        bool any_tie;      // others are as good
+        void push(Index vertex, Index beyond) { corners[size++] = {vertex, beyond}; }
+
+        Corner corners[kMaxSteps + 2];
+        Index size;
+        Index best;    // sees the segment under the largest angle
+        End best_end;  // its dual end
+        bool any_tie;  // others are as good
     };
+
+    enum Side { kRight, kLeft };
 
     Critical to_input(Critical found) const noexcept;
     Critical find_in_mesh(Index i, Index j);
     Critical between(Index h) const;
     Critical walk(Index i, Index j, Index h);
     Critical search(Index i, Index j);
-    void add(Chain& chain, Index i, Index j, Index vertex, Index beyond, const End& end) const;
+    int is_inside(int side, Index i, Index j, const Chain& chain, Index vertex) const noexcept;
     Index first_of_best(Index i, Index j, const Chain& chain) const;
     Index first_of_polygon(Index h, Index first) const;
     bool is_out_of_reach(Index i, Index j, Index right, Index left) const noexcept;
@@ -131,7 +138,7 @@ class CriticalPoints {
     std::vector<Index> fan_;  // of each vertex the half-edge from it that comes first counter-clockwise
     std::vector<Index> degree_;
     std::vector<Index> rank_;  // number in the mesh of each vertex of the input
-    Chain left_, right_;
+    Chain chains_[2];
 };
 
 }  // namespace tensor_stereo

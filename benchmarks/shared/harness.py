@@ -14,6 +14,8 @@ import torch
 
 from shared.results import write_records
 
+_SETTLE_S = 0.15  # threads of the case before, OpenBLAS's above all, spin for as long before they rest
+
 
 class Suite:
     """One suite of comparisons; prints each and writes all as JSON.
@@ -65,6 +67,7 @@ class Suite:
                 call()
             for _ in range(repeats or self.options.repeats):
                 for name, call in cases.items():
+                    time.sleep(_SETTLE_S)
                     cpu_start, start = time.process_time(), time.perf_counter()
                     call()
                     wall[name].append(time.perf_counter() - start)

@@ -55,7 +55,7 @@ kernels: $(READY)  ## Build and run the C++ tests
 
 sanitize: $(READY)  ## Build and run the C++ tests with the address and undefined-behaviour sanitizers
 	$(CMAKE) -S kernels -B build/sanitize -DTENSOR_STEREO_PYTHON=OFF -DTENSOR_STEREO_TESTS=ON \
-	  -DTENSOR_STEREO_SANITIZE=ON -DCMAKE_BUILD_TYPE=RelWithDebInfo
+	  -DTENSOR_STEREO_SANITIZE=ON -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG="-O1 -g1"
 	$(CMAKE) --build build/sanitize --parallel
 	build/sanitize/test_kernels
 
@@ -76,7 +76,7 @@ package: $(READY)  ## Build a wheel, install it into a fresh environment and run
 	cd build/package/run && ../venv/bin/tensor-stereo --version && ../venv/bin/tensor-stereo demo --num-pairs 1 --out demo
 
 BENCH_VENV ?= .venv-bench
-SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/images speed/scaling \
+SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/images speed/memory speed/busy speed/scaling \
   speed/adversarial speed/sweep speed/scores accuracy/ranking accuracy/soft_ranking
 
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)

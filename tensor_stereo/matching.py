@@ -13,8 +13,6 @@ from tensor_stereo.ops import nearest_ssd
 from tensor_stereo.ops.reference_ssd import NONE, open_gates, pack
 from tensor_stereo.types import Features, Matches
 
-_MAX_DESCRIPTOR = 2**50  # keeps the SSD finite
-
 
 class MatchIndices(NamedTuple):
     """Putative matches of B pairs as rows of the two :class:`Features`.
@@ -128,11 +126,6 @@ def _check_features(features0: Features, features1: Features) -> None:
     if features0.descriptors.shape[1:] != features1.descriptors.shape[1:] or features0.descriptors.ndim != 2:
         shapes = f"{tuple(features0.descriptors.shape)} and {tuple(features1.descriptors.shape)}"
         raise ValueError(f"descriptors of features0 and features1 must be (N, D) with one D, got {shapes}")
-    for name, features in (("features0", features0), ("features1", features1)):
-        extremes = features.descriptors.aminmax() if features.descriptors.numel() else (0.0, 0.0)
-        peak = max(abs(float(value)) for value in extremes)  # that of NaN is NaN
-        if not peak <= _MAX_DESCRIPTOR:
-            raise ValueError(f"descriptors of {name} must be finite and at most 2**50, got {peak:g}")
 
 
 def _select(

@@ -8,7 +8,7 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
-#include <cstddef>
+#include <cstring>
 #include <limits>
 #include <mutex>
 #include <vector>
@@ -65,10 +65,10 @@ struct Range {
         part = std::max(part, *std::max_element(rest, rest + kLanes));
     }
 
-    // Whether float32 holds all products and sums of `size` terms.
+    // Whether float32 holds all products, their sums and the sums of squared differences of `size` terms.
     bool is_exact(std::int64_t size) const {
-        const double peak = std::max(-least, most);
-        return part == 0 && 2 * static_cast<double>(size) * peak * peak <= 16777216.0;
+        const double peak = std::max(-least, most), span = static_cast<double>(most) - least;
+        return part == 0 && static_cast<double>(size) * std::max(2 * peak * peak, span * span) <= 16777216.0;
     }
 };
 
@@ -88,6 +88,7 @@ struct Workspace {
     std::vector<std::int64_t> index1;
     bool is_bytes = false;
     std::int64_t quads = 0;
+    std::vector<std::int32_t> missing1;     // of the products of bytes
     std::vector<std::uint8_t> byte_panels;  // (panel, quads, 2 N, 4)
     std::vector<std::int8_t> byte_rows;     // (kChunk, 4 quads) less 128
 };
@@ -124,6 +125,7 @@ TENSOR_STEREO_INLINE void prepare(const Job& job, std::int64_t b, Workspace& wor
     if (work.is_bytes) {
         work.byte_panels.assign(num_panels * work.quads * 4 * kByteColumns, 0);
         work.byte_rows.resize(kChunk * work.quads * 4);
+        work.missing1.assign(num_panels * 2 * N, 0);
     } else {
         work.panels.assign(num_panels * size * 2 * N, 0);
     }
@@ -136,7 +138,7 @@ TENSOR_STEREO_INLINE void prepare(const Job& job, std::int64_t b, Workspace& wor
             for (std::int64_t k = 0; k < size; ++k) {
                 bytes[k / 4 * 4 * kByteColumns + k % 4] = static_cast<std::uint8_t>(values[k]);
             }
-            work.square1[j] -= 256 * sum_of<false>(values, size);  // rows are less by 128 and enter twice
+            work.missing1[j] = 128 * static_cast<std::int32_t>(sum_of<false>(values, size));  // rows are less by 128
         } else {
             for (std::int64_t k = 0; k < size; ++k) work.panels[(panel * size + k) * 2 * N + column] = values[k];
         }
@@ -153,7 +155,13 @@ class Mask {
     TENSOR_STEREO_INLINE explicit Mask(const typename Vector<N>::Integers& lanes) {
         typedef std::int8_t Bytes __attribute__((vector_size(N)));
         const Bytes bytes = __builtin_convertvector(lanes, Bytes);
-        std::memcpy(words_, &bytes, sizeof bytes);
+        if constexpr (std::endian::native == std::endian::little) {
+            std::memcpy(words_, &bytes, sizeof bytes);
+        } else {
+            std::uint8_t byte[N];
+            std::memcpy(byte, &bytes, sizeof bytes);
+            for (int l = 0; l < N; ++l) words_[l / 8] |= static_cast<std::uint64_t>(byte[l]) << (8 * (l % 8));
+        }
     }
 
     TENSOR_STEREO_INLINE bool is_empty() const { return N <= 8 ? words_[0] == 0 : (words_[0] | words_[1]) == 0; }
@@ -240,9 +248,10 @@ struct Chunk {
         byte_products(row, work.byte_panels.data() + j * work.quads * 4, work.quads, sums);
         for (int r = 0; r < kRows; ++r) {
             for (int p = 0; p < 2; ++p) {
-                typename Vector<N>::Integers part;
+                typename Vector<N>::Integers part, missing;
                 std::memcpy(&part, sums[r] + p * N, sizeof part);
-                sum[r][p] = __builtin_convertvector(part, Lanes<N>);
+                std::memcpy(&missing, work.missing1.data() + j + p * N, sizeof missing);
+                sum[r][p] = __builtin_convertvector(part + missing, Lanes<N>);
             }
         }
     }

@@ -35,7 +35,8 @@ def detect_sift(images: Tensor, config: SIFTConfig | None = None) -> Features:
     0.8), and a share of correct ones that is 1.3 percentage points lower. The default is Lowe's method.
 
     Images of more than 4 megapixels are detected in tiles and, for keypoints of scale 7.2 px and more, at half
-    their size (:func:`tensor_stereo.features.tiles.detect_in_tiles`), so that memory stays below 2 GB.
+    their size (:func:`tensor_stereo.features.tiles.detect_in_tiles`), so that memory stays
+    below 2 GB up to 40 megapixels.
 
     Images are detected one by one: kornia's operators choose another order of summation for a batch. With kornia, the
     bits (not the result to single precision) also depend on ``torch.get_num_threads()``. No gradient.

@@ -1,4 +1,4 @@
-"""Large images in tiles, for detectors that keep many copies of an image: memory does not grow with its size."""
+"""Large images in tiles, for detectors that keep a dozen copies of an image of twice its size."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def detect_in_tiles(detect: Callable[[Tensor], ScaledFeatures], image: Tensor) -
     """Detect in overlapping tiles where an image is large, and in the image itself where it is not.
 
     A detector of difference-of-Gaussian extrema (Lowe, IJCV 60(2), 2004) holds a dozen copies of an image of twice its
-    size: 3 GB for 12 megapixels. Images of more than 4 megapixels are therefore split. Keypoints of the first three
+    size: 3 GB for 12 megapixels. Images of more than 4 megapixels are therefore split; then memory is that of 4
+    megapixels and 20 bytes for each pixel of the image. Keypoints of the first three
     octaves (scales below 7.2 px) come from tiles that overlap by more than such a keypoint can see: they are those of
     the whole image. Those of larger scale come from the image at half its size, by the same rule: they are those of the
     whole image up to a few hundredths of their scale.
@@ -93,6 +94,6 @@ def _tiles(size: int) -> Iterator[_Tile]:
 
 def _half(image: Tensor) -> Tensor:
     """Every second pixel of the image after a blur, the first at the same place."""
-    blurred = gaussian_blur2d(image[None, None], (7, 7), (_HALF_BLUR_PX, _HALF_BLUR_PX))
+    blurred = gaussian_blur2d(image[None, None], (7, 7), (_HALF_BLUR_PX, _HALF_BLUR_PX), "replicate")
     half: Tensor = blurred[0, 0, ::2, ::2]
     return half

@@ -43,10 +43,10 @@ def nearest_ssd(
     are then compared there, by the reference; otherwise the work is done on the CPU.
 
     Args:
-        keypoints0: (N0, 2) px of view 0, finite.
-        keypoints1: (N1, 2) px of view 1, finite.
-        descriptors0: (N0, D) float32.
-        descriptors1: (N1, D) float32.
+        keypoints0: (N0, 2) px of view 0, finite unless all gates are open.
+        keypoints1: (N1, 2) px of view 1, likewise.
+        descriptors0: (N0, D) float32, finite and at most 2**50 in magnitude.
+        descriptors1: (N1, D) float32, likewise.
         ptr0: (B + 1,) int64 offsets of the images of view 0.
         ptr1: (B + 1,) int64 offsets of the images of view 1.
         max_row_offset_px: largest row offset; infinity opens the gate.
@@ -65,7 +65,12 @@ def nearest_ssd(
         tensor([0, 1])
     """
     kernels = native(backend)
-    is_open = all(math.isinf(gate) for gate in (max_row_offset_px, min_disparity_px, max_disparity_px))
+    gates = (max_row_offset_px, min_disparity_px, max_disparity_px)
+    if any(math.isnan(gate) for gate in gates):
+        raise ValueError(f"max_row_offset_px, min_disparity_px and max_disparity_px must not be NaN, got {gates}")
+    is_open = reference_ssd.is_open(*gates)
+    for name, descriptors in (("features0", descriptors0), ("features1", descriptors1)):
+        reference_ssd.check_descriptors(name, descriptors)
     if kernels is None or (is_open and descriptors0.device.type != "cpu"):
         config = MatchingConfig(
             max_row_offset_px=max_row_offset_px, min_disparity_px=min_disparity_px, max_disparity_px=max_disparity_px

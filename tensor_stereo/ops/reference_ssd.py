@@ -22,6 +22,7 @@ _CHUNK_DENSE = 2**20  # entries of a dense SSD matrix that are formed at a time
 _CHUNK_VALUES = 2**17  # descriptor values that are compared at a time: 512 kB, which stay in the cache
 _CHUNK_CANDIDATES = 2**18  # candidates that are listed at a time
 _MAX_COORDINATE_PX = 2**24
+_MAX_DESCRIPTOR = 2**50  # keeps the SSD finite
 
 
 def nearest_ssd(features0: Features, features1: Features, config: MatchingConfig) -> tuple[Tensor, ...]:
@@ -39,7 +40,7 @@ def nearest_ssd(features0: Features, features1: Features, config: MatchingConfig
         tensor([0, 1])
     """
     best = Best.empty(features0, features1)
-    if all(math.isinf(gate) for gate in open_gates(config)):
+    if is_open(*open_gates(config)):
         _search_dense(features0, features1, best)
     else:
         for index0, index1 in gated_candidates(features0, features1, config):
@@ -62,6 +63,24 @@ def open_gates(config: MatchingConfig) -> tuple[float, float, float]:
         -math.inf if config.min_disparity_px is None else config.min_disparity_px,
         math.inf if config.max_disparity_px is None else config.max_disparity_px,
     )
+
+
+def is_open(max_row_offset_px: float, min_disparity_px: float, max_disparity_px: float) -> bool:
+    """Whether these gates let everything through.
+
+    Example:
+        >>> is_open(math.inf, -math.inf, math.inf), is_open(math.inf, math.inf, math.inf)
+        (True, False)
+    """
+    return (max_row_offset_px, min_disparity_px, max_disparity_px) == (math.inf, -math.inf, math.inf)
+
+
+def check_descriptors(name: str, descriptors: Tensor) -> None:
+    """Raise unless all descriptors are finite and so small that their SSD is."""
+    extremes = descriptors.aminmax() if descriptors.numel() else (0.0, 0.0)
+    peak = max(abs(float(value)) for value in extremes)  # that of NaN is NaN
+    if not peak <= _MAX_DESCRIPTOR:
+        raise ValueError(f"descriptors of {name} must be finite and at most 2**50, got {peak:g}")
 
 
 @dataclass
@@ -242,9 +261,12 @@ def _blocks(counts: Tensor) -> Iterator[tuple[int, int]]:
 def _search_dense(features0: Features, features1: Features, best: Best) -> None:
     """Candidates without gates: one matrix product per pair, in blocks of rows."""
     size = features0.descriptors.shape[1]
-    peak = max(float(f.descriptors.abs().max()) if f.descriptors.numel() else 0.0 for f in (features0, features1))
-    whole = all(bool((f.descriptors == f.descriptors.round()).all()) for f in (features0, features1))
-    exact = whole and peak <= 256 and 2 * size * peak**2 <= 2**24  # TF32 and bfloat16 hold whole numbers up to 256
+    values = torch.cat([f.descriptors.flatten() for f in (features0, features1)])
+    low, high = (float(value) for value in values.aminmax()) if values.numel() else (0.0, 0.0)
+    whole = bool((values == values.round()).all())
+    peak = max(-low, high)
+    largest = size * max(2 * peak**2, (high - low) ** 2)  # of all products and sums
+    exact = whole and peak <= 256 and largest <= 2**24  # TF32 and bfloat16 hold whole numbers up to 256
     search = _search_exact if exact else _search_rounded
     bounds0, bounds1 = (pairwise(f.ptr.tolist()) for f in (features0, features1))
     for (start, stop), (first, last) in zip(bounds0, bounds1, strict=True):

@@ -59,6 +59,10 @@ def test_tiles_cover_an_axis_once_and_see_what_their_keypoints_see() -> None:
             assert (tile.outer.stop - tile.outer.start) ** 2 <= tiles.MAX_PIXELS
 
 
+def test_thin_images_are_halved_too() -> None:
+    assert torch.allclose(tiles._half(torch.ones(1, 9)), torch.ones(1, 5))
+
+
 def test_half_size_keeps_the_place_of_the_first_pixel() -> None:
     ramp = torch.arange(40.0).expand(30, 40)
     assert torch.allclose(tiles._half(ramp)[:, 3:-3], ramp[::2, ::2][:, 3:-3], atol=1e-4)

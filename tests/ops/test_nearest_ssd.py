@@ -39,7 +39,7 @@ def test_kernel_equals_the_reference_bit_for_bit(gate: tuple[float, float, float
 
 
 @pytest.mark.skipif("native" not in installed_backends(), reason="the native kernels are not installed")
-@pytest.mark.parametrize("kind", ["windows", "large", "offset", "tiny", "copies", "halves"])
+@pytest.mark.parametrize("kind", ["windows", "large", "offset", "tiny", "copies", "halves", "signed"])
 def test_dense_kernel_equals_the_reference_whatever_the_descriptors(kind: str) -> None:
     rng = torch.Generator().manual_seed(3)
     lengths, size = ((301, 130), (257, 190)), 121
@@ -51,6 +51,7 @@ def test_dense_kernel_equals_the_reference_whatever_the_descriptors(kind: str) -
         "tiny": lambda v: v * 1e-22,  # squares underflow
         "copies": lambda v: v[torch.randint(20, (len(v),), generator=rng)],
         "halves": lambda v: (v * 8).round() / 2,
+        "signed": lambda v: (3300 * v).round() - 1650,  # products are exact, sums of squared differences are not
     }[kind]
     vectors0, vectors1 = map(change, vectors)
     if kind == "copies":
@@ -65,6 +66,31 @@ def test_dense_kernel_equals_the_reference_whatever_the_descriptors(kind: str) -
         found = nearest_ssd(*arguments, "native")
         torch.set_num_threads(threads)
         assert all(map(torch.equal, found, expected))
+
+
+@pytest.mark.skipif("native" not in installed_backends(), reason="the native kernels are not installed")
+@pytest.mark.parametrize("size", [3, 121, 1225, 2025])
+def test_bytes_are_multiplied_exactly_also_in_large_windows(size: int) -> None:
+    rng = torch.Generator().manual_seed(size)
+    level = 78 if size > 200 else 250  # dark enough for sums that float32 holds
+    vectors0 = (level + 4 * torch.rand(90, size, generator=rng)).round()
+    vectors1 = torch.cat([vectors0[:50], (level + 4 * torch.rand(40, size, generator=rng)).round()])
+    ptr = torch.tensor([0, 90])
+    arguments = torch.zeros(90, 2), torch.zeros(90, 2), vectors0, vectors1, ptr, ptr, *OPEN
+    found, expected = nearest_ssd(*arguments, "native"), nearest_ssd(*arguments, "scipy")
+    assert all(map(torch.equal, found, expected))
+    assert (found[0][:50] == 0).all()
+
+
+@pytest.mark.parametrize("backend", installed_backends())
+def test_gates_and_descriptors_that_mean_nothing_are_refused(backend: str) -> None:
+    points, ptr = torch.zeros(2, 2), torch.tensor([0, 2])
+    vectors = torch.ones(2, 3)
+    with pytest.raises(ValueError, match="must not be NaN"):
+        nearest_ssd(points, points, vectors, vectors, ptr, ptr, math.nan, 0.0, 1.0, backend)
+    for wrong in (math.nan, math.inf, 1e30):
+        with pytest.raises(ValueError, match="descriptors of features1 must be finite"):
+            nearest_ssd(points, points, vectors, vectors * wrong, ptr, ptr, *OPEN, backend)
 
 
 def test_order_of_summation_is_exact_for_whole_numbers_and_close_otherwise() -> None:

@@ -1,6 +1,7 @@
 // The points that bound the dual Voronoi edge of a link.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <vector>
@@ -12,8 +13,6 @@
 #include "tensor_stereo/triangulation.hpp"
 
 namespace tensor_stereo {
-
-inline constexpr Index kBlocked = -2;
 
 // How negative a signed dual length may get before the link counts as blocked: the sum of both parts.
 struct Reach {
@@ -54,7 +53,8 @@ class CriticalPoints {
    public:
     static constexpr Index kMaxSteps = 48;
 
-    explicit CriticalPoints(Reach reach, Index max_steps = kMaxSteps) : reach_(reach), max_steps_(max_steps) {}
+    explicit CriticalPoints(Reach reach, Index max_steps = kMaxSteps)
+        : reach_(reach), max_steps_(std::min(max_steps, kMaxSteps)) {}
 
     // Both must live on and stay as they are.
     void prepare(const Triangulation& mesh, const GraphEdges& edges);

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from tensor_stereo.configs import MatchingConfig as MatchingConfig
     from tensor_stereo.configs import PipelineConfig as PipelineConfig
     from tensor_stereo.configs import SGBMConfig as SGBMConfig
+    from tensor_stereo.dense.confidence import DisparityConfidence as DisparityConfidence
+    from tensor_stereo.dense.confidence import ScoredDisparity as ScoredDisparity
+    from tensor_stereo.dense.confidence import score_disparity as score_disparity
     from tensor_stereo.dense.filtering import FilteredDisparity as FilteredDisparity
     from tensor_stereo.dense.filtering import filter_disparity as filter_disparity
     from tensor_stereo.dense.interpolation import interpolate_disparity as interpolate_disparity
@@ -53,6 +56,8 @@ __getattr__, __dir__, __all__ = attach(
         "FilterConfig": "configs",
         "FilterOutput": "modules",
         "FilteredDisparity": "dense.filtering",
+        "DisparityConfidence": "dense.confidence",
+        "ScoredDisparity": "dense.confidence",
         "Matches": "types",
         "MatchingConfig": "configs",
         "PipelineConfig": "configs",
@@ -70,6 +75,7 @@ __getattr__, __dir__, __all__ = attach(
         "interpolate_disparity": "dense.interpolation",
         "run_pipeline": "pipeline",
         "sample_disparity": "dense.partners",
+        "score_disparity": "dense.confidence",
         "score_dataset": "evaluation.dataset",
         "score_matches": "scores.by_name",
     },

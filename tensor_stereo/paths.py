@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 TABLES = (".csv", ".parquet")  # endings of tables that are written
+MAPS = (".pfm", ".png", ".npy", ".tif", ".tiff")  # endings of maps that are read and written
 
 
 def check_source(name: str, path: Path, endings: Sequence[str] = ()) -> Path:

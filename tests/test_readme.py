@@ -47,8 +47,10 @@ def write_pair(pair: StereoPair, left: Path, right: Path) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder of a reader, with the files of the pair in the picture."""
-    write_pair(render_pair((2016, 4)), tmp_path / "left.png", tmp_path / "right.png")
+    """The working folder of a reader, with the files of the pair in the picture and a disparity map."""
+    pair = render_pair((2016, 4))
+    write_pair(pair, tmp_path / "left.png", tmp_path / "right.png")
+    write_pfm(tmp_path / "map.pfm", pair.disparity_gt.numpy())
     monkeypatch.chdir(tmp_path)
     torch.set_printoptions(profile="default")
     return tmp_path

@@ -13,7 +13,18 @@ from typing import Annotated, Any
 import tyro
 
 from tensor_stereo.cli.checks import check
-from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.cli.commands import (
+    Classify,
+    Confidence,
+    Demo,
+    Download,
+    Evaluate,
+    Filter,
+    Index,
+    Render,
+    Report,
+    Sweep,
+)
 from tensor_stereo.cli.endings import BAD_INPUT, INTERRUPTED, fail
 from tensor_stereo.cli.flags import name_flags
 from tensor_stereo.waiting import wait_passively
@@ -21,6 +32,7 @@ from tensor_stereo.waiting import wait_passively
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Classify, tyro.conf.subcommand("classify")]
+    | Annotated[Confidence, tyro.conf.subcommand("confidence")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Filter, tyro.conf.subcommand("filter")]
     | Annotated[Download, tyro.conf.subcommand("download")]

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report, Sweep
+from tensor_stereo.cli.commands import (
+    Classify,
+    Confidence,
+    Demo,
+    Download,
+    Evaluate,
+    Filter,
+    Index,
+    Render,
+    Report,
+    Sweep,
+)
 from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
 from tensor_stereo.interop.formats import check_files
 from tensor_stereo.interop.match_lists import find_match_files, is_many
 from tensor_stereo.interop.result_names import check_score_name
-from tensor_stereo.paths import TABLES, check_apart, check_folder, check_source, prepare_folder, prepare_target
+from tensor_stereo.paths import MAPS, TABLES, check_apart, check_folder, check_source, prepare_folder, prepare_target
 
 FIGURES = (".png",)
 
@@ -37,16 +48,29 @@ def _check_demo(command: Demo) -> None:
 
 
 def _check_classify(command: Classify) -> None:
-    for name in ("left", "right", "disparity_gt"):
+    _check_files(command, ("left", "right", "disparity_gt"), TABLES)
+
+
+def _check_confidence(command: Confidence) -> None:
+    for name in ("disparity", "disparity1"):
         path = getattr(command, name)
+        if path is not None:
+            check_source(name, path, (*MAPS, ".pgm"))
+    _check_files(command, ("left", "right", "disparity", "disparity1", "disparity_gt"), MAPS)
+    _check_least("stride", command.stride, 1)
+
+
+def _check_files(command: Classify | Confidence, sources: Sequence[str], endings: Sequence[str]) -> None:
+    """Files that one pair is read from, and the result and the figure that are written."""
+    given = {name: getattr(command, name) for name in sources}
+    for name, path in given.items():
         if path is not None:
             check_source(name, path)
-    for name, endings in (("out", TABLES), ("figure", FIGURES)):
+    for name, allowed in (("out", endings), ("figure", FIGURES)):
         path = getattr(command, name)
         if path is not None:
-            sources = {"left": command.left, "right": command.right, "disparity_gt": command.disparity_gt}
-            check_apart(name, path, sources)
-            prepare_target(name, path, endings)
+            check_apart(name, path, given)
+            prepare_target(name, path, allowed)
     check_gt_scale(command.gt_scale)
     check_sample_bits(command.sample_bits)
 
@@ -129,6 +153,7 @@ def _check_sweep(command: Sweep) -> None:
 _CHECKS: dict[type, Callable[[Any], None]] = {
     Demo: _check_demo,
     Classify: _check_classify,
+    Confidence: _check_confidence,
     Evaluate: _check_evaluate,
     Filter: _check_filter,
     Download: _check_download,

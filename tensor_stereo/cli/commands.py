@@ -48,6 +48,44 @@ class Classify:
 
 
 @dataclass(frozen=True)
+class Confidence:
+    """How likely is every pixel of a disparity map right, whichever method made it?"""
+
+    left: tyro.conf.Positional[Path]
+    """Image of view 0, rectified."""
+    right: tyro.conf.Positional[Path]
+    """Image of view 1."""
+    disparity: tyro.conf.Positional[Path]
+    """Map of view 0, x0 - x1 in px: .pfm, .png, .npy or .tiff."""
+    disparity1: Path | None = None
+    """Map of view 1 in the same form, which makes the result better."""
+    scale: float | None = None
+    """Stored value / px of both maps, which integers need: 256 for KITTI, 16 for what OpenCV's matchers return."""
+    unknown: float | None = None
+    """Stored value of an unknown disparity, besides 0 of a PNG, NaN and infinity."""
+    max_error_px: float = 1.0
+    """A pixel is right if its error is at most this, .5 to 12 px,"""
+    max_error_share: float = 0.0
+    """or at most this share of its estimate. KITTI's rule is --max-error-px 3 --max-error-share 0.05."""
+    stride: int = 1
+    """Distance in px of the pixels that are judged."""
+    threshold: float | None = None
+    """Least probability of a kept pixel; 0.5 if not given."""
+    min_precision: float | None = None
+    """Keep as many pixels as this expected precision allows, instead."""
+    disparity_gt: Path | None = None
+    """Ground-truth disparity of view 0: PFM, 8-bit or 16-bit PNG."""
+    gt_scale: float | None = None
+    """Stored value / px of disparity in a PNG of ground truth."""
+    sample_bits: int | None = None
+    """Bits in use, 8 to 16, of views that store 16 bits per sample and do not tell."""
+    out: Path | None = None
+    """File of the probabilities: .pfm, .png (16 bits, 65535 is 1), .npy or .tiff."""
+    figure: Path | None = None
+    """PNG of the map, its confidence, what is kept and, with ground truth, its errors."""
+
+
+@dataclass(frozen=True)
 class Evaluate:
     """Classify every pair below a folder: the paper's tables, with the verdict of the score beside them."""
 

@@ -10,7 +10,8 @@ from typing import Any, get_type_hints
 from tensor_stereo import configs
 from tensor_stereo.cli import commands
 
-_FILES = {"source": "MATCHES", "left": "LEFT", "right": "RIGHT", "root": "ROOT", "roots": "ROOTS", "runs": "RUNS"}
+_FILES = {"source": "MATCHES", "left": "LEFT", "right": "RIGHT", "disparity": "DISPARITY", "root": "ROOT"}
+_FILES |= {"roots": "ROOTS", "runs": "RUNS"}
 _FILES |= {"settings": "SETTINGS", "releases": "RELEASES", "matches": "MATCHES"}
 
 

@@ -14,7 +14,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from tensor_stereo.cli.commands import Classify, Demo, Download, Evaluate, Filter, Index, Render, Report
+from tensor_stereo.cli.commands import (
+    Classify,
+    Confidence,
+    Demo,
+    Download,
+    Evaluate,
+    Filter,
+    Index,
+    Render,
+    Report,
+)
 from tensor_stereo.cli.endings import OK, fail, most_frequent
 from tensor_stereo.cli.progress import show_progress, time_left
 from tensor_stereo.configs import EvaluationConfig
@@ -207,6 +217,20 @@ def _run_classify(command: Classify) -> int:
     return _check_kept(summary.num_kept, summary.num_matches, num_agreeing)
 
 
+def _run_confidence(command: Confidence) -> int:
+    from tensor_stereo.reports.confidence import score_disparity_files
+
+    summary = score_disparity_files(**vars(command))
+    for name, value in asdict(summary).items():
+        if value is not None:
+            print(f"{name:20}{value:10.4f}" if isinstance(value, float) else f"{name:20}{value:10}")
+    if not summary.num_known:
+        return fail(f"{command.disparity} knows no disparity")
+    if summary.bad is not None and summary.bad != summary.bad:
+        return fail(f"no pixel has known ground truth in {command.disparity_gt}, so there are no rates")
+    return OK
+
+
 def _check_kept(num_kept: int, num_matches: int, num_agreeing: int) -> int:
     """The exit code: an empty result although most matches agree is hardly what was asked for."""
     if num_kept or 2 * num_agreeing <= num_matches:
@@ -254,6 +278,7 @@ def _print_tables(tables: Iterable[Any]) -> None:
 _RUNNERS: dict[type, Callable[[Any], int]] = {
     Demo: _run_demo,
     Classify: _run_classify,
+    Confidence: _run_confidence,
     Evaluate: _run_evaluate,
     Filter: _run_filter,
     Download: _run_download,

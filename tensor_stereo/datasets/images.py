@@ -131,7 +131,7 @@ def read_disparity_png(path: StrPath, scale: float) -> NDArray[np.float32]:
     array([[ nan, 1.  , 2.25]], dtype=float32)
     """
     check_gt_scale(scale)
-    stored = _decode_grey(path)
+    stored = decode_grey(path)
     if stored.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path} must be an 8-bit or 16-bit disparity map, got {stored.dtype}")
     largest = int(np.iinfo(stored.dtype).max)
@@ -160,7 +160,7 @@ def read_occlusion_mask(path: StrPath) -> NDArray[np.bool_]:
     ...     read_occlusion_mask(f"{folder}/mask0nocc.pgm")
     array([[False,  True, False]])
     """
-    stored = _decode_grey(path)
+    stored = decode_grey(path)
     others = np.setdiff1d(stored, (UNKNOWN, OCCLUDED, VISIBLE))
     if len(others):
         raise ValueError(f"{path} must hold only 0, 128 and 255, found {others[:5].tolist()}")
@@ -178,7 +178,7 @@ def read_nonzero_mask(path: StrPath) -> NDArray[np.bool_]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is empty, damaged or coloured.
     """
-    occluded: NDArray[np.bool_] = _decode_grey(path) != 0
+    occluded: NDArray[np.bool_] = decode_grey(path) != 0
     return occluded
 
 
@@ -219,7 +219,7 @@ def read_sintel_occlusion(path: StrPath) -> NDArray[np.bool_]:
     return hidden
 
 
-def _decode_grey(path: StrPath) -> NDArray[Any]:
+def decode_grey(path: StrPath) -> NDArray[Any]:
     """(H, W) stored values of a one-channel image, whatever their range."""
     samples = decode(path).samples
     if samples.ndim == 2:

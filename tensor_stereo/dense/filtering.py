@@ -1,4 +1,4 @@
-"""Dense disparity maps: a grid of their pixels as matches, and the filter's verdict on each."""
+"""Dense disparity maps: verdicts on a grid of their pixels, by the confidence of the map or by a filter of matches."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tensor_stereo.batching import lengths_to_ptr, select_matches
 from tensor_stereo.delaunay.one_to_one import coincident_ids, first_of_coincident
+from tensor_stereo.dense.confidence import score_disparity
 from tensor_stereo.modules import DelaunayFilter, FilterOutput, Images
 from tensor_stereo.ops.segments import pair_of, to_points
 from tensor_stereo.types import Matches, check_mask, check_pixels, check_tensor
@@ -41,24 +42,30 @@ def filter_disparity(
     images0: Images | None = None,
     images1: Images | None = None,
 ) -> FilteredDisparity:
-    """Decide for every grid point of a disparity map whether its neighbours in the grid stay its neighbours in view 1.
+    """Decide which grid points of a disparity map are right.
 
-    The point (x, y) and its disparity d are the match (x, y) -> (x - d, y). The result stays on the grid, because the
-    pixels between were not looked at; it belongs to ``disparity[..., ::stride, ::stride]``. Points that meet in view 1
-    at the same place hide each other: the filter sees the one of the largest disparity, which is the nearest surface,
-    and the others are no inliers. A region that is wrong as a whole, shifted by one constant, looks like an object and
-    is kept inside.
+    With images and without ``filter`` this is :func:`tensor_stereo.score_disparity` on a grid: ``score`` is the
+    calibrated probability of an error of at most 1 px, and points of at least .5 are inliers.
+
+    Otherwise the point (x, y) and its disparity d are the match (x, y) -> (x - d, y), and a filter of matches decides,
+    without images :class:`tensor_stereo.DelaunayFilter`: whether the neighbours in the grid stay neighbours in view 1.
+    Points that meet in view 1 at the same place hide each other: the filter sees the one of the largest disparity,
+    which is the nearest surface, and the others are no inliers. A region that is wrong as a whole, shifted by one
+    constant, looks like an object and is kept inside.
+
+    The result stays on the grid, because the pixels between were not looked at; it belongs to ``disparity[...,
+    ::stride, ::stride]``.
 
     Args:
         disparity: (B, 1, H, W) float32 or float64, x0 - x1 in px, of any sign; (H, W) for one map, then without these
             axes in ``mask`` and in the result. NaN and infinite values are no matches, nor are those whose partner lies
             outside columns 0..W - 1.
         stride: distance of the grid's points in px, at least 1. The grid starts at pixel (0, 0).
-        filter: takes the matches that are not hidden, as Matches without cost, and returns a FilterOutput; None is
-            ``DelaunayFilter()``.
+        filter: takes the matches that are not hidden, as Matches without cost, and returns a FilterOutput; None: the
+            confidence of the map where there are images, else ``DelaunayFilter()``.
         mask: (B, 1, H, W) bool; where it is False, disparities are no matches. None means all.
-        images0: Images of view 0, the view of the map, at which the score ``learned`` looks: (B, C, H, W), or a list of
-            (C, H, W); handed to the filter.
+        images0: Images of view 0, the view of the map: (B, C, H, W), or a list of (C, H, W); handed to the filter if
+            there is one, of any size then.
         images1: Images of view 1.
 
     Returns:
@@ -107,6 +114,11 @@ def filter_disparity(
     found = (partner >= 0) & (partner <= width - 1)  # False for NaN and infinity
     if mask is not None:
         found &= mask[:, 0, ::stride, ::stride]
+    if filter is None and images0 is not None and images1 is not None:
+        known = disparity if mask is None else disparity.masked_fill(~mask, torch.nan)
+        scored = score_disparity(known, images0, images1, stride=stride)
+        probability = scored.probability * found[:, None]
+        return FilteredDisparity(scored.keep() & found[:, None], probability, found[:, None], grid)
     # Select before computing: a NaN that meets the graph would back-propagate.
     values = sampled[found]  # (M,)
     keypoints0 = grid.expand(*found.shape, 2)[found]

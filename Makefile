@@ -76,7 +76,7 @@ package: $(READY)  ## Build a wheel, install it into a fresh environment and run
 	cd build/package/run && ../venv/bin/tensor-stereo --version && ../venv/bin/tensor-stereo demo --num-pairs 1 --out demo
 
 BENCH_VENV ?= .venv-bench
-SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/images speed/memory speed/busy speed/scaling \
+SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/images speed/memory speed/busy speed/confidence speed/scaling \
   speed/adversarial speed/sweep speed/scores accuracy/ranking accuracy/soft_ranking
 
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)

@@ -15,14 +15,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packa
 from shared.results import RESULTS, read_records
 
 SUITES = {
-    "images": "By `speed/images.py`. StereoSGBM: block 5, P1 200, P2 800, 128 disparities, no post-processing, both images padded on the left"
-    " by 128 replicated columns.",
+    "images": "By `speed/images.py`. StereoSGBM: block 5, P1 200, P2 800, 128 disparities, no post-processing, both images"
+    " padded on the left by 128 replicated columns.",
     "classify": "By `speed/classify.py`. Graphs and the paper's verdict, without images.",
     "soft": "By `speed/soft.py`. The score `topology` and its gradient beside the hard verdict.",
-    "confidence_speed": "By `speed/confidence.py`: the confidence of a semi-global map beside the making of the map.",
+    "confidence_speed": "By `speed/confidence.py`. The confidence of a semi-global map beside the making of the map.",
     "busy": "By `speed/busy.py`. The command line in a process of its own, beside two processes that never rest.",
-    "memory": "By `speed/memory.py`. Peak memory above what the process held before, images included: a pair of 3892 x 3108 px for every"
-    " detector; the eight scenes one after the other.",
+    "memory": "By `speed/memory.py`. Peak memory above what the process held before, images included: a pair of 3892 x"
+    " 3108 px for every detector; the eight scenes one after the other.",
 }
 
 

@@ -15,8 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packa
 from shared.results import RESULTS, read_records
 
 SUITES = {
-    "images": "By `speed/images.py`. StereoSGBM: block 5, P1 200, P2 800, 128 disparities, no post-processing, both images"
-    " padded on the left by 128 replicated columns.",
+    "images": "By `speed/images.py`. StereoSGBM: block 5, P1 200, P2 800, 128 disparities, no post-processing, both"
+    " images padded on the left by 128 replicated columns.",
     "classify": "By `speed/classify.py`. Graphs and the paper's verdict, without images.",
     "soft": "By `speed/soft.py`. The score `topology` and its gradient beside the hard verdict.",
     "confidence_speed": "By `speed/confidence.py`. The confidence of a semi-global map beside the making of the map.",

@@ -111,6 +111,25 @@ def check_apart(name: str, path: Path, sources: dict[str, Path | None]) -> None:
             raise ValueError(f"{name} must be another file than {other}, got {path} for both")
 
 
+def prepare_targets(targets: dict[str, tuple[Path | None, Sequence[str]]], sources: dict[str, Path | None]) -> None:
+    """Check all files that a call writes, and make their folders.
+
+    Args:
+        targets: By the name of its argument every file, None if it is not wanted, and its allowed endings.
+        sources: By the name of its argument every file that is read.
+
+    Raises:
+        ValueError: if one is read too, or is another one that is written; for what :func:`prepare_target` refuses.
+        OSError: as :func:`prepare_target`.
+    """
+    taken = dict(sources)
+    for name, (path, endings) in targets.items():
+        if path is not None:
+            check_apart(name, path, taken)
+            prepare_target(name, path, endings)
+            taken[name] = path
+
+
 def prepare_folder(name: str, path: Path) -> Path:
     """Make a folder that shall be written to, and raise unless it can be.
 

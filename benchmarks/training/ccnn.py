@@ -36,6 +36,7 @@ from training.train_confidence import (
     STEPS,
     WEIGHT_DECAY,
     Item,
+    draw_part,
     keep_scenes,
     record_scene,
 )
@@ -72,9 +73,7 @@ def score_ccnn(network: CCNN, disparity: NDArray[np.float32]) -> NDArray[np.floa
 def crop(item: Item, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     disparity = np.load(item.disparity_path, mmap_mode="r")
     error = np.load(item.error_path, mmap_mode="r")
-    free = (max(size - part, 0) for size, part in zip(error.shape, CROP, strict=True))
-    top, left = (int(rng.integers(0, size + 1)) for size in free)
-    part = (slice(top, top + CROP[0]), slice(left, left + CROP[1]))
+    part = draw_part(error.shape, rng)
     values, wrong = (torch.from_numpy(np.array(array[part])) for array in (disparity, error))
     if rng.random() < 0.5:
         values, wrong = values.flip(0), wrong.flip(0)

@@ -105,13 +105,16 @@ def load(item: Item, rows: slice = slice(None), columns: slice = slice(None)) ->
     return torch.from_numpy(np.array(planes, np.float32)), torch.from_numpy(np.array(error))
 
 
+def draw_part(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[slice, slice]:
+    """Rows and columns of a random crop."""
+    free = [max(size - part, 0) for size, part in zip(shape, CROP, strict=True)]
+    top, left = (int(rng.integers(0, size + 1)) for size in free)
+    return slice(top, top + CROP[0]), slice(left, left + CROP[1])
+
+
 def crop(item: Item, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """A random part of a map, padded with what is unknown; upside down in half the cases."""
-    height, width = np.load(item.error_path, mmap_mode="r").shape
-    top, left = (
-        int(rng.integers(0, max(size - part, 0) + 1)) for size, part in zip((height, width), CROP, strict=True)
-    )
-    planes, error = load(item, slice(top, top + CROP[0]), slice(left, left + CROP[1]))
+    planes, error = load(item, *draw_part(np.load(item.error_path, mmap_mode="r").shape, rng))
     if rng.random() < DROP_OTHER:
         planes[-1 - NUM_OTHER : -1] = 0
     if rng.random() < 0.5:

@@ -22,7 +22,15 @@ from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
 from tensor_stereo.interop.formats import check_files
 from tensor_stereo.interop.match_lists import find_match_files, is_many
 from tensor_stereo.interop.result_names import check_score_name
-from tensor_stereo.paths import MAPS, TABLES, check_apart, check_folder, check_source, prepare_folder, prepare_target
+from tensor_stereo.paths import (
+    MAPS,
+    TABLES,
+    check_folder,
+    check_source,
+    prepare_folder,
+    prepare_target,
+    prepare_targets,
+)
 
 FIGURES = (".png",)
 
@@ -66,11 +74,7 @@ def _check_files(command: Classify | Confidence, sources: Sequence[str], endings
     for name, path in given.items():
         if path is not None:
             check_source(name, path)
-    for name, allowed in (("out", endings), ("figure", FIGURES)):
-        path = getattr(command, name)
-        if path is not None:
-            check_apart(name, path, given)
-            prepare_target(name, path, allowed)
+    prepare_targets({"out": (command.out, endings), "figure": (command.figure, FIGURES)}, given)
     check_gt_scale(command.gt_scale)
     check_sample_bits(command.sample_bits)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -103,7 +105,8 @@ class DisparityConfidence(nn.Module):
         super().__init__()
         check_settings(max_error_px, max_error_share, stride)
         self.max_error_px, self.max_error_share, self.stride = max_error_px, max_error_share, stride
-        self.network = load_confidence()
+        with torch.inference_mode(False):  # as in load_confidence
+            self.network = deepcopy(load_confidence())  # its own: modules are moved and trained
 
     def extra_repr(self) -> str:
         return f"max_error_px={self.max_error_px}, max_error_share={self.max_error_share}, stride={self.stride}"
@@ -203,18 +206,22 @@ def score_disparity(
     return found
 
 
-def load_confidence(device: torch.device | None = None) -> ConfidenceNetwork:
+@cache
+def load_confidence() -> ConfidenceNetwork:
     """The network with the weights of this package, in evaluation mode and without gradients of its weights.
+
+    Returns:
+        One network per process, on the CPU, shared by all callers.
 
     >>> load_confidence().training
     False
     """
     from safetensors.torch import load_file
 
-    with torch.inference_mode(False):
+    with torch.inference_mode(False):  # weights that were made in it could never take part in a gradient
         network = ConfidenceNetwork().float()
         network.load_state_dict(load_file(WEIGHTS))
-        return network.requires_grad_(False).eval().to(device or torch.device("cpu"))
+        return network.requires_grad_(False).eval()
 
 
 def read_maps(name: str, disparity: Tensor, scale: float | None = None, unknown: float | None = None) -> Tensor:

@@ -65,7 +65,7 @@ def measure_map(
         *_of_other(filled, columns, disparity1, stride),
         np.full_like(filled, np.log2(stride) / 2),
     ]
-    return np.stack(planes).astype(np.float32)
+    return np.stack(planes, dtype=np.float32, casting="same_kind")
 
 
 def search_range(disparity: Floats) -> tuple[int, int]:

@@ -30,8 +30,8 @@ def nearest_ssd(features0: Features, features1: Features, config: MatchingConfig
 
     With gates, keypoints of view 1 are sorted into cells of one pixel, and the cells inside the gate of a keypoint are
     runs in that order. Without gates a matrix product per pair finds the candidates: directly where its float32 result
-    is exact (whole numbers, 2 D max**2 <= 2**24; ``kornia.feature.match_nn`` picks the neighbours), otherwise in
-    float64, and all that could be nearest within rounding are compared by their cost.
+    is exact (whole numbers, 2 D max**2 and D (max - min)**2 <= 2**24; ``kornia.feature.match_nn`` picks the
+    neighbours), otherwise in float64, and all that could be nearest within rounding are compared by their cost.
 
     Example:
         >>> ptr = torch.tensor([0, 2])

@@ -18,7 +18,7 @@ from tensor_stereo.datasets.map_files import read_map, write_confidence
 from tensor_stereo.dense.confidence import ScoredDisparity, check_settings, check_verdict, score_disparity
 from tensor_stereo.dense.confidence_network import TOLERANCES_PX
 from tensor_stereo.features import to_gray
-from tensor_stereo.paths import MAPS, check_apart, has_ending, prepare_target
+from tensor_stereo.paths import MAPS, has_ending, prepare_targets
 from tensor_stereo.reports.figures import DPI, write_figure
 
 _WIDTH_IN, _GAP_IN, _LABEL_IN = 5.0, 0.15, 0.3  # of one panel
@@ -105,12 +105,7 @@ def score_disparity_files(
         None if path is None else Path(path) for path in (disparity1, disparity_gt, out, figure)
     )
     sources = {"left": left, "right": right, "disparity": disparity, "disparity1": disparity1}
-    for name, path, endings in (("out", out, MAPS), ("figure", figure, (".png",))):
-        if path is not None:
-            check_apart(name, path, sources | {"disparity_gt": disparity_gt})
-            prepare_target(name, path, endings)
-    if out is not None and figure is not None:
-        check_apart("figure", figure, {"out": out})
+    prepare_targets({"out": (out, MAPS), "figure": (figure, (".png",))}, sources | {"disparity_gt": disparity_gt})
     check_settings(max_error_px, max_error_share, stride)
     check_verdict(threshold, min_precision)
     image0, image1 = (read_image(path, sample_bits=sample_bits) for path in (left, right))

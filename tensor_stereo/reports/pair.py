@@ -19,7 +19,7 @@ from tensor_stereo.evaluation.metrics import Rates, match_rates
 from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.features import to_gray
 from tensor_stereo.objects import trace_objects
-from tensor_stereo.paths import TABLES, check_apart, has_ending, prepare_target
+from tensor_stereo.paths import TABLES, has_ending, prepare_targets
 from tensor_stereo.pipeline import PipelineOutput, run_pipeline
 from tensor_stereo.reports.figures import draw_classification, write_figure
 from tensor_stereo.scores import Origin
@@ -93,10 +93,8 @@ def classify_files(
     config = config or PipelineConfig()
     left, right = Path(left), Path(right)
     disparity_gt, out, figure = (None if path is None else Path(path) for path in (disparity_gt, out, figure))
-    for name, path, endings in (("out", out, TABLES), ("figure", figure, (".png",))):
-        if path is not None:
-            check_apart(name, path, {"left": left, "right": right, "disparity_gt": disparity_gt})
-            prepare_target(name, path, endings)
+    sources = {"left": left, "right": right, "disparity_gt": disparity_gt}
+    prepare_targets({"out": (out, TABLES), "figure": (figure, (".png",))}, sources)
     check_gt_scale(gt_scale)
     check_sample_bits(sample_bits)
     if gt_scale is not None and (disparity_gt is None or has_ending(disparity_gt, ".pfm")):

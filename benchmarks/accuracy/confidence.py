@@ -37,7 +37,7 @@ from accuracy.confidence_measures import (
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
 from shared.scenes import EIGHT, read_pairs
-from shared.sparsification import area, auc, cumulative_wrong
+from shared.sparsification import area, auc, cumulative_wrong, keep_expected
 from training.ccnn import CCNN, score_ccnn
 from training.dense_maps import both_maps
 from training.scenes import Views, list_scenes, read_views
@@ -126,11 +126,9 @@ def measure(found: dict[str, Tensor], wrong: Tensor) -> dict[str, dict[str, floa
         figures[name] |= {f"precision at {c:g}": float(r) for c, r in zip(COVERAGES, right, strict=True)}
         if name in OURS:
             figures[name]["calibration error"] = calibration_error(values, ~wrong)
-            order = torch.argsort(values, descending=True)
-            expected = values[order].double().cumsum(0) / torch.arange(1, len(values) + 1)
-            kept = int((expected >= 0.95).nonzero().max()) + 1 if bool((expected >= 0.95).any()) else 0
-            figures[name]["precision of .95"] = float((~wrong[order[:kept]]).double().mean()) if kept else 1.0
-            figures[name]["coverage of .95"] = kept / len(values)
+            kept = keep_expected(values, 0.95)
+            figures[name]["precision of .95"] = float((~wrong[kept]).double().mean()) if len(kept) else 1.0
+            figures[name]["coverage of .95"] = len(kept) / len(values)
     return figures
 
 

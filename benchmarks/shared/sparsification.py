@@ -42,3 +42,15 @@ def auc(score: Tensor, correct: Tensor) -> float:
     if not positives or not negatives:
         return float("nan")
     return float((rank[correct].sum() - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def keep_expected(probability: Tensor, precision: float) -> Tensor:
+    """Indices of the most that have an expected share of right ones, best first.
+
+    >>> keep_expected(torch.tensor([0.5, 1.0, 0.9]), 0.9).tolist()
+    [1, 2]
+    """
+    order = torch.argsort(probability, descending=True)
+    expected = probability[order].double().cumsum(0) / torch.arange(1, len(order) + 1)
+    enough = (expected >= precision).nonzero()
+    return order[: int(enough.max()) + 1] if len(enough) else order[:0]

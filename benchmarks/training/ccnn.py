@@ -4,9 +4,9 @@
 
 Source: Poggi & Mattoccia, "Learning from scratch a confidence measure", BMVC 2016, section 3: four layers of 64 filters
 of 3 x 3 over patches of 9 x 9 disparities, two of 100 and one of one neuron, here as convolutions. It is trained on the
-maps that ``train_confidence.py`` has left in WORK/dense, by as many crops and by the same schedule; an error is one
-above 3 px in KITTI, above 1 px elsewhere. WORK/dense receives ccnn-K.safetensors, trained without fold K, and
-ccnn.safetensors.
+maps that ``train_confidence.py`` has left in WORK/dense, by as many crops, by the same schedule, and for about the same
+time: its layers work at full size, so that its crops are smaller. An error is one above 3 px in KITTI, above 1 px
+elsewhere. WORK/dense receives ccnn-K.safetensors, trained without fold K, and ccnn.safetensors.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from torch.nn import functional
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from training.scenes import NUM_FOLDS, list_scenes
 from training.train_confidence import (
-    CROP,
     CROPS_AT_ONCE,
     LEARNING_RATE,
     SEED,
@@ -41,6 +40,7 @@ from training.train_confidence import (
     record_scene,
 )
 
+CROP = (64, 128)
 _REACH = 4  # px of a patch around its centre
 _UNIT_PX = 64.0  # of the disparities that it sees
 
@@ -73,7 +73,7 @@ def score_ccnn(network: CCNN, disparity: NDArray[np.float32]) -> NDArray[np.floa
 def crop(item: Item, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     disparity = np.load(item.disparity_path, mmap_mode="r")
     error = np.load(item.error_path, mmap_mode="r")
-    part = draw_part(error.shape, rng)
+    part = draw_part(error.shape, CROP, rng)
     values, wrong = (torch.from_numpy(np.array(array[part])) for array in (disparity, error))
     if rng.random() < 0.5:
         values, wrong = values.flip(0), wrong.flip(0)

@@ -2,9 +2,10 @@
 
     python benchmarks/training/train_confidence.py DATA TRAINING_DATA WORK weights_confidence.safetensors
 
-The scenes are those of ``scenes.py``, the maps those of ``dense_maps.py``. WORK/dense receives what the network sees of
-every map (15 GB), and the networks of the cross-validation; with ``--leave-out FAMILY`` also one fold is trained
-without the maps of a family of methods. Everything follows from the seeds below; each training runs on one thread.
+The scenes are those of ``scenes.py``, the maps those of ``dense_maps.py``; ``matching_network.py`` must have run.
+WORK/dense receives what the network sees of every map (20 GB), and the networks of the cross-validation; with
+``--leave-out FAMILY ...`` also one fold is trained without the maps of each of these families of methods. Everything
+follows from the seeds below; each training runs on one thread.
 """
 
 from __future__ import annotations
@@ -32,16 +33,18 @@ from tensor_stereo.dense.map_evidence import NUM_OTHER, measure_map
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.calibration_error import calibration_error
-from shared.sparsification import area, auc
-from training.dense_maps import METHODS, both_maps, family
+from shared.sparsification import area, auc, keep_expected
+from training.dense_maps import ALTERED, FAMILIES, METHODS, both_maps, family, make_methods
+from training.matching_network import load_matching
 from training.platt_scaling import fit_calibration
 from training.scenes import NUM_FOLDS, Scene, list_scenes, read_views
+from training.smooth_maps import altered
 
 SEED, STEPS, CROPS_AT_ONCE, CROP = 0, 2200, 6, (128, 192)
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-2
 DROP_OTHER = 0.5  # share of the crops that are shown without the map of view 1
 STRIDES = (1, 2, 4)
-MAPS = {"middlebury": 7, "eth3d": 7, "kitti": 3, "rendered": 3, "synthetic": 2}  # of a scene, of all methods
+MAPS = {"middlebury": 9, "eth3d": 9, "kitti": 4, "rendered": 4, "synthetic": 3}  # of a scene, of all methods
 NUM_SYNTHETIC = 40
 _MOST_DISPARITIES = 256
 _CALIBRATION_PIXELS = 4000  # of a map
@@ -72,7 +75,8 @@ def record_scene(folder: Path, scene: Scene, number: int) -> list[Item]:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     rng = np.random.default_rng([SEED, number])
-    methods = [str(m) for m in rng.permutation(list(METHODS))[: MAPS[scene.domain]]]
+    every = METHODS if scene.domain == "kitti" else (*METHODS, ALTERED)  # KITTI's truth is sparse
+    methods = [str(m) for m in rng.permutation(every)[: MAPS[scene.domain]]]
     factor = rng.uniform(1.05, 1.6)
     items = [
         Item(
@@ -87,13 +91,16 @@ def record_scene(folder: Path, scene: Scene, number: int) -> list[Item]:
     truth = np.where(np.isfinite(views.disparity0), views.disparity0, np.nan)
     most = factor * float(np.nanquantile(truth, 0.999))
     count = int(np.clip(np.ceil(most / 16) * 16, 32, _MOST_DISPARITIES))
+    known = make_methods(load_matching(folder, number))
     for method in methods:
-        disparity, other = both_maps(method, views.image0, views.image1, count)
+        if method == ALTERED:
+            disparity, other = altered(truth.astype(np.float32), views.image0, rng), None
+        else:
+            disparity, other = both_maps(known[method], views.image0, views.image1, count)
         for item in (item for item in items if item.method == method):
             s = item.stride
-            if not item.path.exists():
-                planes = measure_map(disparity, views.image0, views.image1, other, s)
-                np.save(item.path, planes.astype(np.float16))
+            planes = measure_map(disparity, views.image0, views.image1, other, s)
+            np.save(item.path, planes.astype(np.float16))
             np.save(item.error_path, np.abs(disparity - truth)[::s, ::s].astype(np.float32))
             np.save(item.disparity_path, np.ascontiguousarray(disparity[::s, ::s]))
     return items
@@ -105,16 +112,15 @@ def load(item: Item, rows: slice = slice(None), columns: slice = slice(None)) ->
     return torch.from_numpy(np.array(planes, np.float32)), torch.from_numpy(np.array(error))
 
 
-def draw_part(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[slice, slice]:
-    """Rows and columns of a random crop."""
-    free = [max(size - part, 0) for size, part in zip(shape, CROP, strict=True)]
-    top, left = (int(rng.integers(0, size + 1)) for size in free)
-    return slice(top, top + CROP[0]), slice(left, left + CROP[1])
+def draw_part(shape: tuple[int, ...], size: tuple[int, int], rng: np.random.Generator) -> tuple[slice, slice]:
+    """Rows and columns of a random crop of a size."""
+    top, left = (int(rng.integers(0, max(length - part, 0) + 1)) for length, part in zip(shape, size, strict=True))
+    return slice(top, top + size[0]), slice(left, left + size[1])
 
 
 def crop(item: Item, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """A random part of a map, padded with what is unknown; upside down in half the cases."""
-    planes, error = load(item, *draw_part(np.load(item.error_path, mmap_mode="r").shape, rng))
+    planes, error = load(item, *draw_part(np.load(item.error_path, mmap_mode="r").shape, CROP, rng))
     if rng.random() < DROP_OTHER:
         planes[-1 - NUM_OTHER : -1] = 0
     if rng.random() < 0.5:
@@ -196,7 +202,8 @@ def cross_validate(
     rng = np.random.default_rng(SEED)
     found = []
     for item in items:
-        if fold is None or item.fold != fold or item.stride != 1 or left_out not in (None, family(item.method)):
+        judged = item.fold == fold and left_out in (None, family(item.method)) and item.method != ALTERED
+        if fold is None or item.stride != 1 or not judged:
             continue
         planes, error = load(item)
         bare = planes.clone()
@@ -249,6 +256,8 @@ def report(found: Sequence[LeftOut], calibration: Tensor) -> dict[str, dict[str,
         figures[key] |= {"share": round(mean[1] / mean[3], 3), "share without view 1": round(mean[2] / mean[3], 3)}
         parts = (torch.cat(part) for part in zip(*pooled[key], strict=True))
         figures[key]["calibration error"] = round(calibration_error(*parts), 4)
+        kept = [correct[keep_expected(likely, 0.95)] for likely, correct in pooled[key]]
+        figures[key]["precision of .95"] = round(float(np.mean([k.double().mean() for k in kept if len(k)])), 4)
     return figures
 
 
@@ -256,7 +265,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in ("data", "training_data", "work", "out"):
         parser.add_argument(name, type=Path)
-    parser.add_argument("--leave-out", nargs="*", default=[], choices=("sgbm", "bm", "wta"))
+    parser.add_argument("--leave-out", nargs="*", default=[], choices=FAMILIES)
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     folder = options.work / "dense"
@@ -272,20 +281,22 @@ def main() -> None:
         tasks = [(None, None), *((fold, None) for fold in range(NUM_FOLDS)), *((0, name) for name in options.leave_out)]
         results = pool.starmap(partial(cross_validate, items), tasks, chunksize=1)
     folds = results[1 : 1 + NUM_FOLDS]
-    left_out = [one for _, found in folds for one in found]
-    calibration = calibrate(left_out)
-    for path, (weights, _) in zip(
-        [options.out, *(folder / f"fold-{k}.safetensors" for k in range(NUM_FOLDS))],
-        results[: 1 + NUM_FOLDS],
-        strict=True,
-    ):
-        weights["calibration"] = calibration
-        save_file({name: values.contiguous() for name, values in weights.items()}, path)
-    figures = {"calibration": calibration.tolist(), **report(left_out, calibration)}
-    for (_, name), (_, found) in list(zip(tasks, results, strict=True))[1 + NUM_FOLDS :]:
-        figures[f"without {name}"] = report(found, calibration)
+    judged = [one for _, found in folds for one in found]
+    calibration = calibrate(judged)
+    paths = [options.out, *(folder / f"fold-{k}.safetensors" for k in range(NUM_FOLDS))]
+    for path, (weights, _) in zip(paths, results, strict=False):
+        save(path, weights, calibration)
+    figures = {"calibration": calibration.tolist(), **report(judged, calibration)}
+    for name, (weights, found) in zip(options.leave_out, results[1 + NUM_FOLDS :], strict=True):
+        never_seen = calibrate([one for one in judged if family(one.item.method) != name])
+        save(folder / f"without-{name}.safetensors", weights, never_seen)
+        figures[f"without {name}"] = report(found, never_seen)
     (folder / "figures.json").write_text(json.dumps(figures, indent=1))
     print(json.dumps(figures, indent=1), f"{time.perf_counter() - start:.0f} s", sep="\n")
+
+
+def save(path: Path, weights: dict[str, Tensor], calibration: Tensor) -> None:
+    save_file({name: values.contiguous() for name, values in (weights | {"calibration": calibration}).items()}, path)
 
 
 if __name__ == "__main__":

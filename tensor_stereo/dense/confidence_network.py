@@ -9,11 +9,11 @@ from torch.nn import functional
 from tensor_stereo.dense.map_evidence import NUM_PLANES
 
 TOLERANCES_PX = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0)  # at which it predicts
-_WIDTHS = (24, 32, 48)  # of features at full, half and quarter size
+_WIDTHS = (24, 32, 48, 64)  # of features at full, half, quarter and eighth size
 
 
 class ConfidenceNetwork(nn.Module):
-    """A small encoder and decoder of three sizes (as Ronneberger et al., MICCAI 2015), over hand-made planes.
+    """A small encoder and decoder of four sizes (as Ronneberger et al., MICCAI 2015), over hand-made planes.
 
     Attributes:
         mean: (NUM_PLANES,) of the planes in training.
@@ -27,7 +27,7 @@ class ConfidenceNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        full, half, quarter = _WIDTHS
+        full, half, quarter, eighth = _WIDTHS
         self.register_buffer("mean", torch.zeros(NUM_PLANES))
         self.register_buffer("scale", torch.ones(NUM_PLANES))
         self.register_buffer("calibration", torch.tensor([[1.0, 0.0]]).repeat(len(TOLERANCES_PX), 1))
@@ -36,7 +36,11 @@ class ConfidenceNetwork(nn.Module):
         self.to_half = nn.Conv2d(full, half, 3, padding=1)
         self.at_half = _Residual(half)
         self.to_quarter = nn.Conv2d(half, quarter, 3, padding=1)
-        self.at_quarter = nn.Sequential(_Residual(quarter, 2), _Residual(quarter, 4))
+        self.at_quarter = _Residual(quarter)
+        self.to_eighth = nn.Conv2d(quarter, eighth, 3, padding=1)
+        self.at_eighth = nn.Sequential(_Residual(eighth, 2), _Residual(eighth, 4))
+        self.from_eighth = nn.Conv2d(quarter + eighth, quarter, 1)
+        self.at_quarter_again = _Residual(quarter)
         self.from_quarter = nn.Conv2d(half + quarter, half, 1)
         self.at_half_again = _Residual(half)
         self.from_half = nn.Conv2d(full + half, full, 1)
@@ -59,6 +63,10 @@ class ConfidenceNetwork(nn.Module):
         full = self.at_full(functional.relu(self.enter(x)))
         half = self.at_half(functional.relu(self.to_half(_shrink(full))))
         quarter = self.at_quarter(functional.relu(self.to_quarter(_shrink(half))))
+        eighth = self.at_eighth(functional.relu(self.to_eighth(_shrink(quarter))))
+        quarter = self.at_quarter_again(
+            functional.relu(self.from_eighth(torch.cat([quarter, _grow(eighth, quarter)], 1)))
+        )
         half = self.at_half_again(functional.relu(self.from_quarter(torch.cat([half, _grow(quarter, half)], 1))))
         full = self.at_full_again(functional.relu(self.from_half(torch.cat([full, _grow(half, full)], 1))))
         least, *steps = self.head(full).unbind(1)

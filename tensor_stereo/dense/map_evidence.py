@@ -20,12 +20,14 @@ MAX_DISPARITIES = 256  # that are searched
 _RANGE_QUANTILE, _RANGE_MARGIN, _LEAST_MARGIN_PX = 0.01, 0.15, 8  # disparities searched beyond those of the map
 _SPREADS = (1, 2, 5, 10)  # of 5 x 5 pixels that are compared, in steps of the grid
 _BOXES = (5, 11, 21, 41)  # for mean and spread of the disparities, in steps of the grid
+_PLANE_BOXES = (11, 41)  # for a plane through the disparities
+_PLANE_TILT = 1e-3  # of one pixel's weight, so that a single column or row has a plane too
 _AGREE_PX = 1.0
 _BAND_BYTES = 2**27  # of the costs that are held at a time
 _RIVAL_PX = 1  # disparities as near to the estimate are no rivals
 _AS_GOOD = 8  # steps of a byte by which the cost of a rival may be higher
 _FAR_PX = 64.0  # distances to the border beyond which they do not matter
-_NUM_OF_MAP = 1 + len(_SPREADS) + 2 * len(_BOXES) + len(_BOXES)
+_NUM_OF_MAP = 1 + len(_SPREADS) + 3 * len(_BOXES) + 4 * len(_PLANE_BOXES)
 _NUM_OF_COSTS = 9
 NUM_PLACE, NUM_GREY, NUM_OTHER = 5, 5, 4
 NUM_PLANES = _NUM_OF_MAP + NUM_PLACE + NUM_CURVES * _NUM_OF_COSTS + NUM_GREY + NUM_OTHER + 1
@@ -117,7 +119,34 @@ def _of_map(filled: Floats, known: NDArray[np.bool_]) -> Planes:
         mean = first / count
         spread_px = np.sqrt(np.maximum(second / count - mean * mean, 0))
         planes += [total / (box * box), np.tanh((level - mean) / 2), np.log1p(spread_px)]
+    for box in _PLANE_BOXES:
+        planes += _of_plane(level, weight, box)
     return planes
+
+
+def _of_plane(level: Floats, weight: Floats, box: int) -> Planes:
+    """The least-squares plane of a box: distance to it, spread around it, and its slopes."""
+    one = np.ones(box, np.float64)
+    ramp = np.arange(box) - box // 2.0
+
+    def total(values: Floats, along_x: NDArray[np.float64], along_y: NDArray[np.float64]) -> Floats:
+        return np.asarray(cv2.sepFilter2D(values, cv2.CV_32F, along_x, along_y, borderType=cv2.BORDER_CONSTANT))
+
+    count = np.maximum(total(weight, one, one), 1)
+    mean_x, mean_y, mean_xx, mean_xy, mean_yy = (
+        total(weight, *along) / count
+        for along in ((ramp, one), (one, ramp), (ramp**2, one), (ramp, ramp), (one, ramp**2))
+    )
+    mean, mean_dx, mean_dy = (total(level, *along) / count for along in ((one, one), (ramp, one), (one, ramp)))
+    mean_dd = total(level * level, one, one) / count
+    tilt = np.float32(_PLANE_TILT)
+    xx, yy, xy = mean_xx - mean_x**2 + tilt, mean_yy - mean_y**2 + tilt, mean_xy - mean_x * mean_y
+    dx, dy = mean_dx - mean * mean_x, mean_dy - mean * mean_y
+    scale = 1 / np.maximum(xx * yy - xy * xy, tilt * tilt)
+    slope_x, slope_y = scale * (yy * dx - xy * dy), scale * (xx * dy - xy * dx)
+    here = mean - slope_x * mean_x - slope_y * mean_y
+    spread_px = np.sqrt(np.maximum(mean_dd - mean * mean - slope_x * dx - slope_y * dy, 0))
+    return [np.tanh((level - here) / 2), np.log1p(spread_px), np.tanh(2 * slope_x), np.tanh(2 * slope_y)]
 
 
 def _of_place(filled: Floats, known: NDArray[np.bool_], columns: Floats, stride: int, width: int) -> Planes:

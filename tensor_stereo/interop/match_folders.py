@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import errno
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tensor_stereo.atomic import append_line, drop_torn_line, whole_file
 from tensor_stereo.configs import FileFilterConfig, FilterConfig
 from tensor_stereo.interop.formats import keypoints_beside
 from tensor_stereo.interop.match_files import filter_file
-from tensor_stereo.interop.match_lists import JOURNAL_FILE, SETTINGS_FILE, MatchFile, find_match_files
+from tensor_stereo.interop.match_lists import KIND, MatchFile, find_match_files
 from tensor_stereo.interop.verdicts import FilterSummary
-from tensor_stereo.locks import lock
 from tensor_stereo.paths import check_folder, has_ending
+from tensor_stereo.result_folders import ResultFolder, Source
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+_LATER = {"images": None, "repair": False, "refine": False}  # settings that earlier releases did not have
 
 
 @dataclass(frozen=True)
@@ -92,38 +89,20 @@ def filter_files(
     if images is not None:
         check_folder("images", Path(images))
     settings = {"config": asdict(config or FileFilterConfig()), "score_name": score_name, **looks}
-    errors: dict[str, str] = {}
-    total = FilterSummary()
-    num_found = 0
-    with (out / JOURNAL_FILE).open("ab", buffering=0) as journal:
-        if not lock(journal):
-            raise ValueError(f"out: another call works on {out}; wait for it or name another folder")
-        _claim(out, json.loads(json.dumps(settings)))
-        drop_torn_line(journal, out / JOURNAL_FILE)
-        known = _read_journal(out / JOURNAL_FILE)
-        for number, file in enumerate(files):
-            result, stamp = out / file.name, _stamp(file)
-            entry = known.get(file.name)
-            if entry is not None and entry["stamp"] == stamp and _sizes(result) == entry["size"]:
-                num_found += 1
-                total += FilterSummary(**entry["summary"])
-            else:
-                try:
-                    summary = _filter_one(file, result, score_name, config, looks)
-                except (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError) as error:
-                    if isinstance(error, OSError) and error.errno in _NO_ROOM:
-                        raise
-                    errors[file.name] = " ".join(str(error).split())
-                    if entry is not None:  # the result of what the file was
-                        for path in (result, keypoints_beside(result)):
-                            path.unlink(missing_ok=True)
-                else:
-                    total += summary
-                    done = {"name": file.name, "stamp": stamp, "size": _sizes(result), "summary": asdict(summary)}
-                    append_line(json.dumps(done, separators=(",", ":")).encode(), journal)
-            if on_progress is not None:
-                on_progress(number + 1, len(files), file.name)
-    return FolderSummary(len(files), num_found, errors, total)
+    folder = ResultFolder(
+        out, KIND, settings, defaults=_LATER, to_json=asdict, from_json=lambda values: FilterSummary(**values)
+    )
+    sources = [_source(file, out / file.name) for file in files]
+    worked = folder.work(
+        sources, lambda k: _filter_one(files[k], out / files[k].name, score_name, config, looks), on_progress
+    )
+    total = sum(worked.summaries.values(), start=FilterSummary())
+    return FolderSummary(len(files), worked.num_found, worked.errors, total)
+
+
+def _source(file: MatchFile, result: Path) -> Source:
+    inputs = (file.source,) if file.keypoints is None else (file.source, file.keypoints)
+    return Source(file.name, inputs, (result, keypoints_beside(result)) if has_ending(result, ".h5") else (result,))
 
 
 def _filter_one(
@@ -137,49 +116,3 @@ def _filter_one(
         config=config,
         **looks,
     )
-
-
-def _sizes(path: Path) -> int | list[int] | None:
-    """Bytes of a result, and of its keypoints if there are some; None if there is none."""
-    if not path.is_file():
-        return None
-    beside = keypoints_beside(path)
-    is_pair = has_ending(path, ".h5") and beside.is_file()
-    return [path.stat().st_size, beside.stat().st_size] if is_pair else path.stat().st_size
-
-
-def _stamp(file: MatchFile) -> list[int]:
-    """What changes when a file or its keypoints change; empty if one is missing."""
-    try:
-        states = [path.stat() for path in (file.source, file.keypoints) if path is not None]
-    except OSError:
-        return []
-    return [value for state in states for value in (state.st_size, state.st_mtime_ns)]
-
-
-def _claim(out: Path, settings: dict[str, Any]) -> None:
-    """Make ``out`` the folder of some settings, or raise if it is that of others."""
-    path = out / SETTINGS_FILE
-    if path.exists():
-        try:
-            known = dict(json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
-        if {"images": None, "repair": False, "refine": False} | known != settings:
-            raise ValueError(f"out: {out} holds results of other settings, see {path.name}; name another folder")
-        return
-    with whole_file(path) as part:
-        part.write_text(json.dumps(settings, indent=1) + "\n", encoding="utf-8")
-
-
-def _read_journal(path: Path) -> dict[str, dict[str, Any]]:
-    """The last entry of each file that is done; a line that the end of its process has torn does not count."""
-    entries: dict[str, dict[str, Any]] = {}
-    for line in path.read_bytes().splitlines() if path.exists() else ():
-        try:
-            entry = json.loads(line)
-            FilterSummary(**entry["summary"])
-            entries[entry["name"]] = {"stamp": None, "size": None} | entry
-        except (ValueError, TypeError, KeyError):
-            continue
-    return entries

@@ -11,7 +11,7 @@ from tensor_stereo.interop.formats import FORMATS, KEYPOINTS_ENDING
 from tensor_stereo.paths import TABLES, check_folder, check_source, has_ending, prepare_folder
 
 LIST_COLUMNS = ("matches", "keypoints")
-SETTINGS_FILE, JOURNAL_FILE = "filter.json", "filter.jsonl"
+KIND = "filter"  # of results: filter.json and filter.jsonl
 
 
 class MatchFile(NamedTuple):
@@ -94,7 +94,7 @@ def _walk(source: Path, out: Path, keypoints: Path | None) -> Iterator[MatchFile
     for folder, folders, names in os.walk(source, followlinks=True):
         here = Path(folder)
         real = here.resolve()
-        is_result = here != source and (here / SETTINGS_FILE).is_file()  # of another call
+        is_result = here != source and (here / f"{KIND}.json").is_file()  # of another call
         if real in visited or real in passed_over or is_result:
             folders.clear()
             if here != source:

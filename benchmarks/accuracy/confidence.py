@@ -23,6 +23,8 @@ from tensor_stereo.dense.confidence import load_confidence
 from tensor_stereo.dense.confidence_network import TOLERANCES_PX, ConfidenceNetwork
 from tensor_stereo.dense.map_evidence import NUM_OTHER, measure_map, search_range
 from tensor_stereo.dense.matching_costs import cost_curves
+from tensor_stereo.evaluation.sparsification import cumulative_wrong
+from tensor_stereo.evaluation.sparsification import sparsification_area as area
 from tensor_stereo.features import to_gray
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
@@ -37,7 +39,7 @@ from accuracy.confidence_measures import (
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
 from shared.scenes import EIGHT, read_pairs
-from shared.sparsification import area, auc, cumulative_wrong, keep_expected
+from shared.sparsification import auc, keep_expected
 from training.ccnn import CCNN, score_ccnn
 from training.dense_maps import both_maps
 from training.scenes import Views, list_scenes, read_views

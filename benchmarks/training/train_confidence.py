@@ -30,10 +30,11 @@ from torch.nn import functional
 
 from tensor_stereo.dense.confidence_network import TOLERANCES_PX, ConfidenceNetwork
 from tensor_stereo.dense.map_evidence import NUM_OTHER, measure_map
+from tensor_stereo.evaluation.sparsification import sparsification_area as area
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.calibration_error import calibration_error
-from shared.sparsification import area, auc, keep_expected
+from shared.sparsification import auc, keep_expected
 from training.dense_maps import ALTERED, FAMILIES, METHODS, both_maps, family, make_methods
 from training.matching_network import load_matching
 from training.platt_scaling import fit_calibration

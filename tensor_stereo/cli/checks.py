@@ -60,12 +60,35 @@ def _check_classify(command: Classify) -> None:
 
 
 def _check_confidence(command: Confidence) -> None:
+    _check_least("stride", command.stride, 1)
+    if command.is_manifest:
+        _check_maps(command)
+        return
+    for name in ("right", "disparity"):
+        if getattr(command, name) is None:
+            raise ValueError(f"{name} must be given beside left, unless left is a manifest, .csv or .parquet")
     for name in ("disparity", "disparity1"):
         path = getattr(command, name)
         if path is not None:
             check_source(name, path, (*MAPS, ".pgm"))
     _check_files(command, ("left", "right", "disparity", "disparity1", "disparity_gt"), MAPS)
-    _check_least("stride", command.stride, 1)
+
+
+def _check_maps(command: Confidence) -> None:
+    """A manifest of maps; what it names itself cannot be given beside it."""
+    check_source("left", command.left)
+    columns = {"disparity1": "disparity1_est", "scale": "est_scale"} | {
+        name: name for name in ("right", "disparity", "disparity_gt", "gt_scale", "sample_bits")
+    }
+    for name, column in columns.items():
+        if getattr(command, name) is not None:
+            instead = f"; its column {column} holds it" if name not in ("right", "disparity") else ""
+            raise ValueError(f"{name} must not be given beside a manifest{instead}")
+    if command.figure is not None:
+        raise ValueError("figure must not be given beside a manifest; draw that of one pair")
+    if command.out is None:
+        raise ValueError("out must name a folder for the results of a manifest")
+    prepare_folder("out", command.out)
 
 
 def _check_files(command: Classify | Confidence, sources: Sequence[str], endings: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ import tyro
 
 from tensor_stereo.configs import EvaluationConfig, FileFilterConfig, PipelineConfig
 from tensor_stereo.datasets.download.releases import RELEASES
+from tensor_stereo.paths import TABLES, has_ending
 
 Flat = tyro.conf.arg(name="")
 
@@ -49,14 +50,21 @@ class Classify:
 
 @dataclass(frozen=True)
 class Confidence:
-    """How likely is every pixel of a disparity map right, whichever method made it?"""
+    """How likely is every pixel of a disparity map right, whichever method made it?
 
-    left: tyro.conf.Positional[Path]
-    """Image of view 0, rectified."""
-    right: tyro.conf.Positional[Path]
-    """Image of view 1."""
-    disparity: tyro.conf.Positional[Path]
-    """Map of view 0, x0 - x1 in px: .pfm, .png, .npy or .tiff."""
+    For one map, or for all maps that a manifest or a list of pairs names in its column disparity_est; a call that ended
+    early goes on where it was.
+    """
+
+    left: Annotated[
+        tyro.conf.Positional[Path],
+        tyro.conf.arg(metavar="LEFT", help="Image of view 0, rectified; or a manifest, .parquet or .csv, alone."),
+    ]
+    right: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RIGHT]", help="Image of view 1.")] = None
+    disparity: Annotated[
+        tyro.conf.Positional[Path | None],
+        tyro.conf.arg(metavar="[DISPARITY]", help="Map of view 0, x0 - x1 in px: .pfm, .png, .npy or .tiff."),
+    ] = None
     disparity1: Path | None = None
     """Map of view 1 in the same form, which makes the result better."""
     scale: float | None = None
@@ -80,9 +88,16 @@ class Confidence:
     sample_bits: int | None = None
     """Bits in use, 8 to 16, of views that store 16 bits per sample and do not tell."""
     out: Path | None = None
-    """File of the probabilities: .pfm, .png (16 bits, 65535 is 1), .npy or .tiff."""
+    """File of the probabilities: .pfm, .png (16 bits, 65535 is 1), .npy or .tiff. For a manifest the folder of such
+    files, one per pair, and of confidence.parquet, one row per pair."""
+    ending: Literal[".png", ".pfm", ".npy", ".tiff"] = ".png"
+    """Of the files in that folder."""
     figure: Path | None = None
     """PNG of the map, its confidence, what is kept and, with ground truth, its errors."""
+
+    @property
+    def is_manifest(self) -> bool:
+        return has_ending(self.left, TABLES)
 
 
 @dataclass(frozen=True)

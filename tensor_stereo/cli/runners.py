@@ -218,16 +218,42 @@ def _run_classify(command: Classify) -> int:
 
 
 def _run_confidence(command: Confidence) -> int:
+    if command.is_manifest:
+        return _run_confidence_of_manifest(command)
     from tensor_stereo.reports.confidence import score_disparity_files
 
-    summary = score_disparity_files(**vars(command))
-    for name, value in asdict(summary).items():
-        if value is not None:
-            print(f"{name:20}{value:10.4f}" if isinstance(value, float) else f"{name:20}{value:10}")
+    settings = {name: value for name, value in vars(command).items() if name != "ending"}
+    summary = score_disparity_files(**settings)
+    values = asdict(summary)
+    for name, value in (values | values.pop("rates")).items():
+        print(f"{name:24}{value:10.4f}" if isinstance(value, float) else f"{name:24}{value:10}")
     if not summary.num_known:
         return fail(f"{command.disparity} knows no disparity")
-    if summary.bad is not None and summary.bad != summary.bad:
+    if summary.rates and summary.rates["bad"] != summary.rates["bad"]:
         return fail(f"no pixel has known ground truth in {command.disparity_gt}, so there are no rates")
+    return OK
+
+
+def _run_confidence_of_manifest(command: Confidence) -> int:
+    from tensor_stereo.reports.confidence_folder import confidence_table, score_disparity_manifest
+
+    taken = ("ending", "unknown", "max_error_px", "max_error_share", "stride", "threshold", "min_precision")
+    begun = time.monotonic()
+    with show_progress("confidence") as show:
+        summary = score_disparity_manifest(
+            command.left,
+            command.out,  # type: ignore[arg-type]
+            **{name: getattr(command, name) for name in taken},
+            on_progress=lambda done, total, name: show(done, total, f"{name}, {time_left(begun, done, total)}"),
+        )
+    print(f"{'num_pairs':24}{summary.num_pairs:10}")
+    print(f"{'num_found':24}{summary.num_found:10}")
+    _print_tables([confidence_table(summary.frame)])
+    print(summary.table)
+    for name, reason in summary.errors.items():
+        fail(f"{name}: {reason}")
+    if summary.errors:
+        return fail(f"{len(summary.errors)} of {summary.num_pairs} pairs failed")
     return OK
 
 

@@ -40,6 +40,9 @@ class PairFiles:
             channels, as its archive says), or ``flyingthings3d-subset`` (PFM with the sign of the optical flow, and
             masks that are not 0 where occluded).
         sample_bits: bits in use of views that store 16 bits per sample and do not tell; None where nothing says so.
+        disparity_est: a disparity map of view 0 that some method has made, whose confidence is asked for.
+        disparity1_est: likewise of view 1.
+        est_scale: stored value / est_scale = disparity in px in both; integers need it.
     """
 
     dataset: str
@@ -53,6 +56,9 @@ class PairFiles:
     calibration: Path | None = None
     gt_encoding: str = "scaled"
     sample_bits: int | None = None
+    disparity_est: Path | None = None
+    disparity1_est: Path | None = None
+    est_scale: float | None = None
 
 
 FolderReader: TypeAlias = Callable[[Path], list[PairFiles]]
@@ -233,8 +239,16 @@ def check_gt_scale(gt_scale: float | None) -> None:
 
     >>> check_gt_scale(3.0)
     """
-    if gt_scale is not None and not 0 < gt_scale < float("inf"):
-        raise ValueError(f"gt_scale (--gt-scale) must be positive and finite, got {gt_scale}")
+    check_scale("gt_scale (--gt-scale)", gt_scale)
+
+
+def check_scale(name: str, scale: float | None) -> None:
+    """Raise unless a scale is None or a positive finite number.
+
+    >>> check_scale("est_scale", 256.0)
+    """
+    if scale is not None and not 0 < scale < float("inf"):
+        raise ValueError(f"{name} must be positive and finite, got {scale}")
 
 
 def check_sample_bits(sample_bits: int | None) -> None:

@@ -17,25 +17,29 @@ from tensor_stereo.datasets.files import (
     SAMPLE_BITS,
     PairFiles,
     StrPath,
-    check_gt_scale,
     check_sample_bits,
+    check_scale,
 )
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.paths import check_ending, has_ending
 from tensor_stereo.table_files import check_name, read_csv, read_parquet, write_table
 
-_PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration")
+_ESTIMATES = ("disparity_est", "disparity1_est")
+_PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration", *_ESTIMATES)
+_SCALES = ("gt_scale", "est_scale")
 SCHEMA = {
     "dataset": pl.String,  # release, e.g. middlebury-2005
     "scene": pl.String,  # unique within its dataset
-    **dict.fromkeys(_PATHS, pl.String),  # absolute paths; null where the release has no such file
+    **dict.fromkeys(_PATHS[:6], pl.String),  # absolute paths; null where the release has no such file
     "gt_scale": pl.Float64,  # stored value / gt_scale = disparity in px; null without ground truth
     "gt_encoding": pl.String,  # scaled, or sintel: how the maps hold their values
     "width_px": pl.Int32,  # of image0
     "height_px": pl.Int32,
     "sample_bits": pl.Int32,  # in use, of views that store 16 bits and do not tell; null: nothing says so
+    **dict.fromkeys(_ESTIMATES, pl.String),  # absolute paths of maps that some method has made
+    "est_scale": pl.Float64,  # stored value / est_scale = disparity in px in these maps
 }
-_OPTIONAL = ("sample_bits",)  # not there in manifests of earlier releases
+OPTIONAL = ("sample_bits", *_ESTIMATES, "est_scale")  # not there in manifests of earlier releases
 _REQUIRED = ("dataset", "scene", "image0", "image1", "gt_encoding", "width_px", "height_px")
 _LISTED = ("image0", "image1")  # what a CSV of paths must have
 
@@ -46,9 +50,9 @@ def build_manifest(
     r"""Find the pairs of folders and lists of paths; only headers of images are read.
 
     A list is a CSV file with the columns ``image0`` and ``image1`` and any of ``disparity_gt``, ``gt_scale``,
-    ``gt_encoding``, ``disparity_noc_gt``, ``mask``, ``calibration``, ``sample_bits``, ``dataset`` (default: the file's
-    name) and ``scene`` (default: the name of ``image0`` without ending). Its paths are absolute or relative to its own
-    folder. Blanks around values do not count.
+    ``gt_encoding``, ``disparity_noc_gt``, ``mask``, ``calibration``, ``sample_bits``, ``disparity_est``,
+    ``disparity1_est``, ``est_scale``, ``dataset`` (default: the file's name) and ``scene`` (default: the name of
+    ``image0`` without ending). Its paths are absolute or relative to its own folder. Blanks around values do not count.
 
     Args:
         roots: folders as :func:`~tensor_stereo.datasets.find_pairs` takes them, and ``.csv`` files. A pair that lies
@@ -102,6 +106,7 @@ def build_manifest(
                 "width_px": width,
                 "height_px": height,
                 "sample_bits": pair.sample_bits,
+                "est_scale": pair.est_scale,
             }
         )
     return pl.DataFrame(rows, schema=SCHEMA)
@@ -125,7 +130,8 @@ def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]
     """Read a manifest and check every entry; no image is opened.
 
     Args:
-        path: Parquet file as :func:`write_manifest` writes it; further columns are ignored.
+        path: Parquet file as :func:`write_manifest` writes it; further columns are ignored. Or a CSV list of paths as
+            :func:`build_manifest` takes it.
         check_files: whether a file that is missing is an error now, or only when it is read.
 
     Returns:
@@ -133,13 +139,17 @@ def read_manifest(path: StrPath, *, check_files: bool = True) -> list[PairFiles]
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no Parquet file, or an entry is wrong; the message names file, row (from 1) and column.
+        ValueError: if it is no such file, or an entry is wrong; the message names file, row (from 1) and column.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no manifest {path}")
+    if has_ending(path, ".csv"):
+        listed = _read_list(path, check_files)
+        _check_names(listed)
+        return listed
     table = read_parquet(path)
-    missing = [name for name in _OPTIONAL if name not in table.columns]
+    missing = [name for name in OPTIONAL if name not in table.columns]
     table = table.with_columns(pl.lit(None, dtype=SCHEMA[name]).alias(name) for name in missing)
     for name, dtype in SCHEMA.items():
         if name not in table.columns:
@@ -162,9 +172,10 @@ def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool)
     for name in ("width_px", "height_px"):
         if not int(str(values[name])) > 0:
             raise ValueError(f"{path}, row {row + 1}: column {name!r} must be positive, got {values[name]}")
-    scale = values["gt_scale"]
-    if scale is not None and not (isinstance(scale, float) and 0 < scale < math.inf):
-        raise ValueError(f"{path}, row {row + 1}: column 'gt_scale' must be positive and finite, got {scale}")
+    for name in _SCALES:
+        scale = values[name]
+        if scale is not None and not (isinstance(scale, float) and 0 < scale < math.inf):
+            raise ValueError(f"{path}, row {row + 1}: column {name!r} must be positive and finite, got {scale}")
     bits = values["sample_bits"]
     if bits is not None and bits not in SAMPLE_BITS:  # type: ignore[operator]
         raise ValueError(f"{path}, row {row + 1}: column 'sample_bits' must {SAMPLE_BITS}, got {bits}")
@@ -178,14 +189,15 @@ def _to_pair(path: Path, row: int, values: dict[str, object], check_files: bool)
     return PairFiles(
         str(values["dataset"]),
         str(values["scene"]),
-        gt_scale=scale,
+        gt_scale=values["gt_scale"],  # type: ignore[arg-type]
         gt_encoding=encoding,
         sample_bits=bits,  # type: ignore[arg-type]
+        est_scale=values["est_scale"],  # type: ignore[arg-type]
         **paths,  # type: ignore[arg-type]
     )
 
 
-def _read_list(path: Path) -> list[PairFiles]:
+def _read_list(path: Path, check_files: bool = True) -> list[PairFiles]:
     """The pairs of a CSV of paths."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no list of pairs {path}")
@@ -203,13 +215,9 @@ def _read_list(path: Path) -> list[PairFiles]:
                 raise ValueError(f"{path}, line {row + 2}: column {name!r} is empty")
         paths = {name: path.parent / values[name] for name in _PATHS if values.get(name)}
         for name, file in paths.items():
-            if not file.is_file():
+            if check_files and not file.is_file():
                 raise FileNotFoundError(f"{path}, line {row + 2}: column {name!r} names {file}, which is no file")
-        try:
-            scale = float(values["gt_scale"]) if values.get("gt_scale") else None
-            check_gt_scale(scale)
-        except ValueError as error:
-            raise ValueError(f"{path}, line {row + 2}: column 'gt_scale': {error}") from error
+        scale, est_scale = (_scale(path, row, name, values.get(name)) for name in _SCALES)
         try:
             bits = _whole(values["sample_bits"]) if values.get("sample_bits") else None
             check_sample_bits(bits)
@@ -224,8 +232,19 @@ def _read_list(path: Path) -> list[PairFiles]:
         if disparity is not None and scale is None and encoding == "scaled" and not has_ending(disparity, ".pfm"):
             raise ValueError(f"{path}, line {row + 2}: column 'gt_scale' is empty, but {disparity} is no PFM file")
         dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
-        pairs.append(PairFiles(dataset, scene, gt_scale=scale, gt_encoding=encoding, sample_bits=bits, **paths))
+        scales = {"gt_scale": scale, "est_scale": est_scale}
+        pairs.append(PairFiles(dataset, scene, gt_encoding=encoding, sample_bits=bits, **scales, **paths))  # type: ignore[arg-type]
     return pairs
+
+
+def _scale(path: Path, row: int, name: str, text: str | None) -> float | None:
+    """A scale of a line of a list, None if it is empty."""
+    try:
+        scale = float(text) if text else None
+        check_scale(name, scale)
+    except ValueError as error:
+        raise ValueError(f"{path}, line {row + 2}: column {name!r}: {error}") from error
+    return scale
 
 
 def _whole(text: str) -> int:

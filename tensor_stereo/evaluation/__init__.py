@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from tensor_stereo.evaluation.metrics import roc_curve as roc_curve
     from tensor_stereo.evaluation.perturbation import add_noise as add_noise
     from tensor_stereo.evaluation.perturbation import inject_outliers as inject_outliers
+    from tensor_stereo.evaluation.sparsification import sparsification_area as sparsification_area
+    from tensor_stereo.evaluation.sparsification import sparsification_curve as sparsification_curve
     from tensor_stereo.evaluation.trials import Trial as Trial
     from tensor_stereo.evaluation.trials import TrialRunner as TrialRunner
     from tensor_stereo.evaluation.truth import errors_against_gt as errors_against_gt
@@ -49,5 +51,7 @@ __getattr__, __dir__, __all__ = attach(
         "roc_auc": "metrics",
         "roc_curve": "metrics",
         "score_dataset": "dataset",
+        "sparsification_area": "sparsification",
+        "sparsification_curve": "sparsification",
     },
 )

@@ -17,12 +17,21 @@ from tensor_stereo.datasets.images import read_image
 from tensor_stereo.datasets.map_files import read_map, write_confidence
 from tensor_stereo.dense.confidence import ScoredDisparity, check_settings, check_verdict, score_disparity
 from tensor_stereo.dense.confidence_network import TOLERANCES_PX
+from tensor_stereo.evaluation.sparsification import sparsification_area
 from tensor_stereo.features import to_gray
 from tensor_stereo.paths import MAPS, has_ending, prepare_targets
 from tensor_stereo.reports.figures import DPI, write_figure
 
 _WIDTH_IN, _GAP_IN, _LABEL_IN = 5.0, 0.15, 0.3  # of one panel
 _UNKNOWN = "#BBBBBB"
+BAD_PX = (0.5, 1.0, 2.0, 3.0, 4.0)  # as Middlebury and KITTI count
+RATES = (
+    *(name + ending for name in ("bad", *(f"bad_{px:g}px" for px in BAD_PX), "epe_px") for ending in ("", "_kept")),
+    "sparsification",
+    "sparsification_optimum",
+)
+"""Share of the known pixels, and of the kept ones, whose error is too large (``bad``: by the tolerance asked for) or
+above some px; mean error; mean share of wrong pixels as the least confident ones are taken away, and its optimum."""
 
 Values = NDArray[np.float32]
 
@@ -36,20 +45,14 @@ class ConfidenceSummary:
         num_known: Those with a disparity.
         num_kept: Those that the verdict keeps.
         expected_precision: Mean probability of the kept ones; NaN without any.
-        bad: Share of the known pixels that are wrong against ground truth; None without it.
-        bad_kept: The same of the kept ones.
-        epe_px: Mean error of the known pixels.
-        epe_kept_px: The same of the kept ones.
+        rates: Against ground truth, by the names of :data:`RATES`; empty without it.
     """
 
     num_pixels: int
     num_known: int
     num_kept: int
     expected_precision: float
-    bad: float | None = None
-    bad_kept: float | None = None
-    epe_px: float | None = None
-    epe_kept_px: float | None = None
+    rates: dict[str, float]
 
 
 def score_disparity_files(
@@ -129,26 +132,50 @@ def score_disparity_files(
         write_confidence(out, found.probability[0, 0].numpy())
     if figure is not None:
         write_figure(draw_confidence(image0, found, kept, truth, title=disparity.name), figure)
-    return _summary(found, kept, truth, max_error_px, max_error_share)
+    return summarize_confidence(found, kept, truth, max_error_px=max_error_px, max_error_share=max_error_share)
 
 
-def _summary(
-    found: ScoredDisparity, kept: Tensor, truth: Tensor | None, max_error_px: float, max_error_share: float
+def summarize_confidence(
+    found: ScoredDisparity,
+    kept: Tensor,
+    truth: Tensor | None = None,
+    *,
+    max_error_px: float = 1.0,
+    max_error_share: float = 0.0,
 ) -> ConfidenceSummary:
-    known = found.known[0, 0]
-    chosen = found.probability[0, 0][kept].double()
+    """Counts of a map and of the part that is kept, and their rates against ground truth.
+
+    Args:
+        found: Of one map.
+        kept: (H', W') bool.
+        truth: (H, W) px, NaN where unknown.
+        max_error_px: A pixel is right if its error is at most this,
+        max_error_share: or at most this share of its estimate.
+
+    >>> zeros = torch.zeros(1, 1, 8, 9)
+    >>> found = ScoredDisparity(zeros, zeros == 0, zeros, torch.zeros(1, 7, 8, 9), 1)
+    >>> summarize_confidence(found, zeros[0, 0] == 0, torch.full((8, 9), 1.5)).rates["bad_1px"]
+    1.0
+    """
+    known, probability = found.known[0, 0], found.probability[0, 0]
+    chosen = probability[kept].double()
     expected = float(chosen.mean()) if len(chosen) else float("nan")
     counts = (known.numel(), int(known.sum()), int(kept.sum()), expected)
     if truth is None:
-        return ConfidenceSummary(*counts)
+        return ConfidenceSummary(*counts, {})
     disparity = found.disparity[0, 0]
     error = (disparity - truth[:: found.stride, :: found.stride]).abs()
-    wrong = error > (max_error_share * disparity.abs()).clamp(max_error_px, TOLERANCES_PX[-1])
     judged = known & error.isfinite()
-    rates = []
-    for values in (wrong.double(), error.double()):
-        rates += [float(values[part].mean()) for part in (judged, judged & kept)]
-    return ConfidenceSummary(*counts, *rates)
+    tolerance = (max_error_share * disparity.abs()).clamp(max_error_px, TOLERANCES_PX[-1])
+    measures = {"bad": error > tolerance} | {f"bad_{px:g}px": error > px for px in BAD_PX} | {"epe_px": error}
+    rates = {}
+    for name, values in measures.items():
+        for ending, part in (("", judged), ("_kept", judged & kept)):
+            rates[name + ending] = float(values[part].double().mean())
+    wrong = measures["bad"][judged]
+    rates["sparsification"] = sparsification_area(probability[judged], wrong)
+    rates["sparsification_optimum"] = sparsification_area(-wrong.float(), wrong)
+    return ConfidenceSummary(*counts, rates)
 
 
 def draw_confidence(

@@ -23,6 +23,7 @@ import torch
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import read_manifest
+from tensor_stereo.datasets.manifest import OPTIONAL
 from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.scores.domain import DomainWarning
 from tensor_stereo.sweeps.engines import Engine, LocalEngine, Outcome
@@ -324,7 +325,7 @@ class WorkerDiedError(RuntimeError):
 def _fingerprint(plan: Plan) -> str:
     """Hash of all that the manifest says of the pairs."""
     # a setting that is not there adds nothing, so that runs of earlier releases go on; astuple copies: a second more
-    rows = [[str(v) for name, v in vars(pair).items() if name != "sample_bits" or v is not None] for pair in plan.pairs]
+    rows = [[str(v) for name, v in vars(pair).items() if name not in OPTIONAL or v is not None] for pair in plan.pairs]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 

@@ -1,0 +1,198 @@
+"""Many disparity maps of a manifest: one file of probabilities per pair, and a table of what they are worth."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import polars as pl
+import torch
+from torch import Tensor
+
+from tensor_stereo.atomic import whole_file
+from tensor_stereo.datasets.files import PairFiles
+from tensor_stereo.datasets.manifest import read_manifest
+from tensor_stereo.datasets.map_files import read_map, write_confidence
+from tensor_stereo.datasets.pairs import read_pair
+from tensor_stereo.dense.confidence import DisparityConfidence, check_verdict
+from tensor_stereo.paths import MAPS, TABLES, check_ending, check_source, prepare_folder
+from tensor_stereo.reports.confidence import RATES, ConfidenceSummary, summarize_confidence
+from tensor_stereo.reports.tables import Table
+from tensor_stereo.result_folders import ResultFolder, Source
+from tensor_stereo.table_files import write_table
+
+KIND = "confidence"  # of the results: confidence.json, confidence.jsonl, confidence.parquet
+_SHOWN = ("bad", "bad_kept", "epe_px", "epe_px_kept", "sparsification", "sparsification_optimum")
+
+
+@dataclass(frozen=True)
+class ManifestSummary:
+    """What became of the maps of a manifest.
+
+    Attributes:
+        num_pairs: All pairs.
+        num_found: Those that an earlier call has finished.
+        errors: Reason of each pair that failed, by its dataset and scene.
+        frame: One row for each of the others; see :func:`confidence_frame`.
+        table: The file of these rows.
+    """
+
+    num_pairs: int
+    num_found: int
+    errors: dict[str, str]
+    frame: pl.DataFrame
+    table: Path
+
+
+def score_disparity_manifest(
+    manifest: Path | str,
+    out: Path | str,
+    *,
+    ending: str = ".png",
+    unknown: float | None = None,
+    max_error_px: float = 1.0,
+    max_error_share: float = 0.0,
+    stride: int = 1,
+    threshold: float | None = None,
+    min_precision: float | None = None,
+    on_progress: Callable[[int, int, str], None] | None = None,
+) -> ManifestSummary:
+    """How likely is every pixel of the disparity maps of many pairs right, and what is left of their errors?
+
+    The probabilities of a pair go to ``DATASET/SCENE`` below ``out``, with an ending. ``confidence.parquet`` holds one
+    row per pair: dataset, scene, the counts of :class:`~tensor_stereo.reports.confidence.ConfidenceSummary` and, where
+    there is ground truth, its rates. Call it again to go on after an interruption: pairs whose files have not changed
+    since are not done again, and those that failed are.
+
+    Args:
+        manifest: A ``.parquet`` manifest or a ``.csv`` list of pairs with the column ``disparity_est`` and optionally
+            ``disparity1_est``, ``est_scale``, ``disparity_gt`` and ``gt_scale``; see
+            :func:`~tensor_stereo.datasets.build_manifest`.
+        out: Folder of the results; it is made.
+        ending: Of the files of probabilities: ``.png`` (16 bits, 65535 is 1), ``.pfm``, ``.npy`` or ``.tiff``.
+        unknown: A stored value of the maps that stands for an unknown disparity.
+        max_error_px: A pixel is right if its error is at most this,
+        max_error_share: or at most this share of its estimate.
+        stride: Distance of the pixels that are judged.
+        threshold: Least probability of a kept pixel; None: .5, unless ``min_precision`` is given.
+        min_precision: Least expected share of the kept pixels of each map that is right.
+        on_progress: Called after each pair with the number of pairs done, their total and the name of the pair.
+
+    Returns:
+        Counts, the rows of the table, and the reason for each one that failed.
+
+    Raises:
+        ValueError: If the manifest is wrong or names no map, a setting lies out of range, or ``out`` holds results of
+            other settings.
+        FileNotFoundError: If the manifest is missing.
+        OSError: If nothing can be written to ``out``.
+    """
+    manifest, out = Path(manifest), Path(out)
+    pairs, sources = find_maps(manifest, out, ending)
+    check_verdict(threshold, min_precision)
+    prepare_folder("out", out)
+    confidence = DisparityConfidence(max_error_px, max_error_share, stride)
+    tolerance = {"max_error_px": max_error_px, "max_error_share": max_error_share}
+    verdict = {"threshold": threshold, "min_precision": min_precision}
+    settings = tolerance | verdict | {"stride": stride, "unknown": unknown, "ending": ending}
+
+    def run(number: int) -> ConfidenceSummary:
+        files, result = pairs[number], sources[number].results[0]
+        pair = read_pair(files)
+        given, other = (
+            None if path is None else _read(name, path, files.est_scale, unknown)
+            for name, path in (("disparity_est", files.disparity_est), ("disparity1_est", files.disparity1_est))
+        )
+        found = confidence(given, pair.image0[None], pair.image1[None], other)
+        kept = found.keep(**verdict)[0, 0]
+        result.parent.mkdir(parents=True, exist_ok=True)
+        write_confidence(result, found.probability[0, 0].numpy())
+        return summarize_confidence(found, kept, pair.disparity_gt, **tolerance)
+
+    folder: ResultFolder[ConfidenceSummary] = ResultFolder(
+        out, KIND, settings, to_json=asdict, from_json=lambda values: ConfidenceSummary(**values)
+    )
+    worked = folder.work(sources, run, on_progress)
+    table, frame = out / f"{KIND}.parquet", confidence_frame(worked.summaries, pairs)
+    with whole_file(table) as part:
+        write_table(frame, part)
+    return ManifestSummary(len(pairs), worked.num_found, worked.errors, frame, table)
+
+
+def _read(name: str, path: Path, scale: float | None, unknown: float | None) -> Tensor:
+    return torch.from_numpy(read_map(path, scale=scale, unknown=unknown, name=name, scale_name="est_scale"))
+
+
+def find_maps(manifest: Path, out: Path, ending: str) -> tuple[list[PairFiles], list[Source]]:
+    """The pairs of a manifest or a list, all of which have a map, and where their results go.
+
+    Args:
+        manifest: ``.parquet`` or ``.csv``.
+        out: Folder of the results.
+        ending: Of the results.
+
+    Raises:
+        ValueError: If it is wrong, a pair has no ``disparity_est``, or two results would have one name.
+        FileNotFoundError: If it is missing.
+    """
+    check_source("manifest", manifest, TABLES)
+    check_ending("ending", Path("confidence" + ending), MAPS)
+    pairs = read_manifest(manifest, check_files=False)
+    if not pairs:
+        raise ValueError(f"manifest: {manifest} lists no pair")
+    taken: dict[Path, str] = {}
+    sources = []
+    for pair in pairs:
+        name = f"{pair.dataset}/{pair.scene}"
+        if pair.disparity_est is None:
+            raise ValueError(f"manifest: {manifest} must name a disparity_est for every pair, {name} has none")
+        inputs = (pair.image0, pair.image1, pair.disparity_est, pair.disparity1_est, pair.disparity_gt)
+        result = out / f"{name}{ending}"
+        place = Path(os.path.normpath(result.absolute()))
+        if not place.is_relative_to(os.path.normpath(out.absolute())):
+            raise ValueError(f"manifest: {manifest} must have names of pairs that stay below out, got {name!r}")
+        if taken.setdefault(place, name) != name:
+            raise ValueError(f"manifest: {manifest} names {taken[place]} and {name}, whose results would have one name")
+        if place in {path.absolute() for path in inputs if path is not None}:
+            raise ValueError(f"out must be another folder than that of the maps, {place} would be replaced")
+        sources.append(Source(name, tuple(path for path in inputs if path is not None), (result,)))
+    return pairs, sources
+
+
+def confidence_frame(summaries: Mapping[str, ConfidenceSummary], pairs: Sequence[PairFiles]) -> pl.DataFrame:
+    """One row per pair that is done: its names, its counts and its rates, null without ground truth.
+
+    >>> confidence_frame({}, []).columns[:3]
+    ['dataset', 'scene', 'num_pixels']
+    """
+    counts = ("num_pixels", "num_known", "num_kept")
+    schema = {"dataset": pl.String, "scene": pl.String, **dict.fromkeys(counts, pl.Int64)}
+    schema |= dict.fromkeys(("expected_precision", *RATES), pl.Float64)
+    rows = []
+    for pair in pairs:
+        summary = summaries.get(f"{pair.dataset}/{pair.scene}")
+        if summary is not None:
+            values = asdict(summary)
+            rows.append({"dataset": pair.dataset, "scene": pair.scene} | values | values.pop("rates"))
+    return pl.DataFrame(rows, schema=schema)
+
+
+def confidence_table(frame: pl.DataFrame) -> Table:
+    """Means over the maps of each data set, and over all: what is kept, and errors before and after.
+
+    >>> confidence_table(confidence_frame({}, [])).columns[:3]
+    ('dataset', 'maps', 'kept %')
+    """
+    kept = (100 * pl.col("num_kept") / pl.col("num_known")).fill_nan(None).mean()
+    means = [pl.len(), kept, *(pl.col(name).fill_nan(None).mean() for name in _SHOWN)]
+    rows = frame.group_by("dataset", maintain_order=True).agg(*_named(means)).rows()
+    if len(rows) > 1:
+        rows += [("all", *row) for row in frame.select(*_named(means)).rows()]
+    cells = [tuple(float("nan") if cell is None else cell for cell in row) for row in rows]
+    return Table("Means over the maps", ("dataset", "maps", "kept %", *_SHOWN), tuple(cells), 4)
+
+
+def _named(means: list[pl.Expr]) -> list[pl.Expr]:
+    return [mean.alias(f"{k}") for k, mean in enumerate(means)]

@@ -1,0 +1,139 @@
+"""Confidence of all maps that a manifest or a list names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+from tensor_stereo.cli import main
+from tensor_stereo.configs import SyntheticConfig
+from tensor_stereo.datasets import build_manifest, read_manifest, write_manifest, write_pfm
+from tensor_stereo.datasets.images import write_image
+from tensor_stereo.datasets.synthetic.rendering import render_pair
+from tensor_stereo.dense import match_semi_global
+from tensor_stereo.evaluation import sparsification_area
+from tensor_stereo.reports import confidence_folder
+from tensor_stereo.reports.confidence import RATES, score_disparity_files
+from tests.cli.failing import fails
+
+COLUMNS = "dataset,scene,image0,image1,disparity_est,disparity1_est,est_scale,disparity_gt\n"
+
+
+@pytest.fixture
+def listed(tmp_path: Path) -> Path:
+    """A list of three rendered pairs: KITTI's integers with truth, PFM with both maps, and PFM without truth."""
+    lines = [COLUMNS]
+    for k in range(3):
+        pair = render_pair(k, SyntheticConfig(width_px=200, height_px=150))
+        write_image(tmp_path / f"left{k}.png", pair.image0)
+        write_image(tmp_path / f"right{k}.png", pair.image1)
+        assert pair.disparity_gt is not None
+        write_pfm(tmp_path / f"truth{k}.pfm", pair.disparity_gt.numpy())
+        maps = match_semi_global(pair.image0, pair.image1)
+        assert maps.disparity1 is not None
+        for name, values in (("map", maps.disparity0[0]), ("map1", maps.disparity1[0])):
+            write_pfm(tmp_path / f"{name}{k}.pfm", values.nan_to_num(torch.inf).numpy())
+            stored = (values.nan_to_num(0).clamp(min=0) * 256).round().numpy().astype(np.uint16)
+            cv2.imwrite(str(tmp_path / f"{name}{k}.png"), stored)
+    lines += ["one,a b,left0.png,right0.png,map0.png,,256,truth0.pfm\n"]
+    lines += ["two,deep/c,left1.png,right1.png,map1.pfm,map11.pfm,,truth1.pfm\n"]
+    lines += ["two,d,left2.png,right2.png,map2.pfm,,,\n"]
+    path = tmp_path / "maps.csv"
+    path.write_text("".join(lines))
+    return path
+
+
+def test_each_pair_gives_what_it_gives_alone(listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "out"
+    main(["confidence", str(listed), "--out", str(out), "--min-precision", "0.9", "--ending", ".npy", "--stride", "2"])
+    printed = capsys.readouterr().out
+    assert "| one " in printed and "| all " in printed and str(out / "confidence.parquet") in printed
+    frame = pl.read_parquet(out / "confidence.parquet")
+    assert frame.select("dataset", "scene").rows() == [("one", "a b"), ("two", "deep/c"), ("two", "d")]
+    settings = {"stride": 2, "min_precision": 0.9}
+    for row, (k, given) in enumerate([
+        (0, {"disparity": "map0.png", "scale": 256, "disparity_gt": "truth0.pfm"}),
+        (1, {"disparity": "map1.pfm", "disparity1": "map11.pfm", "disparity_gt": "truth1.pfm"}),
+        (2, {"disparity": "map2.pfm"}),
+    ]):  # fmt: skip
+        views = [tmp_path / f"{side}{k}.png" for side in ("left", "right")]
+        paths = {name: tmp_path / v if isinstance(v, str) else v for name, v in given.items()}
+        alone = tmp_path / "alone.npy"
+        summary = score_disparity_files(*views, **settings, out=alone, **paths)  # type: ignore[arg-type]
+        name = "/".join(frame.row(row)[:2])
+        assert (out / f"{name}.npy").read_bytes() == alone.read_bytes()
+        assert frame["num_kept"][row] == summary.num_kept
+        assert {name: frame[name][row] for name in RATES} == dict.fromkeys(RATES) | summary.rates
+
+
+def test_rates_are_those_of_the_errors(listed: Path, tmp_path: Path) -> None:
+    views = [tmp_path / f"{side}0.png" for side in ("left", "right")]
+    summary = score_disparity_files(
+        *views, tmp_path / "map0.pfm", disparity_gt=tmp_path / "truth0.pfm", out=tmp_path / "c.npy", max_error_px=2
+    )
+    pair = render_pair(0, SyntheticConfig(width_px=200, height_px=150))
+    error = (match_semi_global(pair.image0, pair.image1).disparity0[0] - pair.disparity_gt).abs()
+    probability = torch.from_numpy(np.load(tmp_path / "c.npy"))
+    judged = error.isfinite()
+    for px in (0.5, 1.0, 2.0, 3.0, 4.0):
+        assert summary.rates[f"bad_{px:g}px"] == float((error[judged] > px).double().mean())
+    assert summary.rates["bad"] == summary.rates["bad_2px"]
+    kept = judged & (probability >= 0.5)
+    assert summary.rates["epe_px_kept"] == pytest.approx(float(error[kept].double().mean()), rel=1e-12)
+    wrong = error[judged] > 2
+    assert summary.rates["sparsification"] == sparsification_area(probability[judged], wrong)
+    assert summary.rates["sparsification_optimum"] <= summary.rates["sparsification"]
+
+
+def test_it_goes_on_where_it_was(listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    manifest, out = tmp_path / "maps.parquet", tmp_path / "out"
+    write_manifest(build_manifest([listed]), manifest)
+    assert [pair.est_scale for pair in read_manifest(manifest)] == [256.0, None, None]
+    hidden = tmp_path / "map2.pfm"
+    hidden.rename(tmp_path / "away.pfm")
+    with pytest.raises(SystemExit) as stop:
+        main(["confidence", str(manifest), "--out", str(out)])
+    assert stop.value.code == 1
+    captured = capsys.readouterr()
+    assert "two/d: disparity_est: there is no file" in captured.err and "1 of 3 pairs failed" in captured.err
+    assert len(pl.read_parquet(out / "confidence.parquet")) == 2
+    (tmp_path / "away.pfm").rename(hidden)
+    summary = confidence_folder.score_disparity_manifest(manifest, out)
+    assert (summary.num_pairs, summary.num_found, summary.errors) == (3, 2, {})
+    (out / "one" / "a b.png").unlink()
+    hidden.write_bytes((tmp_path / "map0.pfm").read_bytes())
+    assert confidence_folder.score_disparity_manifest(manifest, out).num_found == 1
+    with pytest.raises(ValueError, match="out: .* holds results of other settings"):
+        confidence_folder.score_disparity_manifest(manifest, out, stride=2)
+
+
+def test_bad_manifests_are_one_line(listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    command = ["confidence", str(listed)]
+    fails(command, capsys, "--out", "folder")
+    fails([*command, "right.png", *out], capsys, "RIGHT")
+    fails([*command, *out, "--scale", "3"], capsys, "--scale", "est_scale")
+    fails([*command, *out, "--disparity-gt", "a.pfm"], capsys, "--disparity-gt", "column")
+    fails([*command, *out, "--figure", "a.png"], capsys, "--figure")
+    fails([*command, *out, "--max-error-px", "0"], capsys, "--max-error-px")
+    fails(["confidence", str(tmp_path / "left0.png")], capsys, "RIGHT", "manifest")
+    text = listed.read_text()
+    for wrong, words in (
+        (text.replace("map2.pfm", ""), ("two/d", "disparity_est")),
+        (text.replace("256", "-1"), ("line 2", "est_scale")),
+        (text.replace("a b", "../../a"), ("one/../../a", "below out")),
+        (text.replace("two,deep/c", "two/.,d"), ("two/./d", "two/d", "one name")),
+        (COLUMNS, ("lists no pair",)),
+    ):
+        listed.write_text(wrong)
+        fails([*command, *out], capsys, *words)
+    listed.write_text(text.replace("256", ""))
+    with pytest.raises(SystemExit) as stop:
+        main([*command, *out])
+    assert stop.value.code == 1
+    assert "one/a b: est_scale must be given" in capsys.readouterr().err

@@ -30,6 +30,7 @@ VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 SCORES: tuple[Score, ...] = get_args(Score)
 CUTS = ("threshold", "target_sensitivity", "min_precision")  # ways from a score to a verdict; one may be given
 LIKELY = 0.5  # probability from which a match is kept where no such way is given
+PIPELINE_STAGES = ("detect", "match", "group", "graph", "relate", "score", "improve")
 DETECTORS: tuple[Detector, ...] = ("sift", "fast", "surf", "gftt")  # order of the paper's Tables 1-4
 LEAST_ERROR_PX, MOST_ERROR_PX = 0.5, 5.0  # tolerances between which a score is calibrated
 COLDEST, HOTTEST = 1e-9, 1e9  # temperatures whose gradients are finite in float32 too

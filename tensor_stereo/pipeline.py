@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tensor_stereo.batching import concatenate_features, split_features
 from tensor_stereo.classification import apply_score, classify_graphs, mask_untested
-from tensor_stereo.configs import PipelineConfig, Rectified
+from tensor_stereo.configs import PIPELINE_STAGES, PipelineConfig, Rectified
 from tensor_stereo.dense.semi_global import SemiGlobalMaps, match_keypoints, match_semi_global
 from tensor_stereo.features import detect_features, to_gray
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
@@ -27,14 +27,13 @@ from tensor_stereo.scores.tolerance import probability_within
 from tensor_stereo.types import Classification, Features, Matches
 
 ImagePair = tuple[Tensor, Tensor]
-STAGES = ("detect", "match", "group", "graph", "relate", "score", "improve")
 
 
 @dataclass
 class Stopwatch:
     """Seconds of wall time spent in each named stage."""
 
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PIPELINE_STAGES, 0.0))
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:

@@ -60,7 +60,9 @@ class Confidence:
         tyro.conf.Positional[Path],
         tyro.conf.arg(metavar="LEFT", help="Image of view 0, rectified; or a manifest, .parquet or .csv, alone."),
     ]
-    right: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RIGHT]", help="Image of view 1.")] = None
+    right: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[RIGHT]", help="Image of view 1.")] = (
+        None
+    )
     disparity: Annotated[
         tyro.conf.Positional[Path | None],
         tyro.conf.arg(metavar="[DISPARITY]", help="Map of view 0, x0 - x1 in px: .pfm, .png, .npy or .tiff."),

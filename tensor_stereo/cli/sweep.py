@@ -11,7 +11,7 @@ from tensor_stereo.cli.commands import Sweep
 from tensor_stereo.cli.endings import INTERRUPTED, OK, fail, most_frequent
 from tensor_stereo.cli.progress import describe_time, show_progress
 from tensor_stereo.datasets import read_manifest
-from tensor_stereo.evaluation.trials import STAGES
+from tensor_stereo.evaluation.rows import STAGES
 from tensor_stereo.sweeps import SweepProgress, build_plan, read_errors, read_grid, read_results, run_sweep
 from tensor_stereo.sweeps.plan import Plan
 from tensor_stereo.sweeps.run import check_trials

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from tensor_stereo.lazy import attach
 
 if TYPE_CHECKING:
-    from tensor_stereo.evaluation.dataset import ROW_SCHEMA as ROW_SCHEMA
     from tensor_stereo.evaluation.dataset import PairEvaluation as PairEvaluation
     from tensor_stereo.evaluation.dataset import evaluate_dataset as evaluate_dataset
     from tensor_stereo.evaluation.dataset import evaluate_pair as evaluate_pair
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from tensor_stereo.evaluation.metrics import roc_curve as roc_curve
     from tensor_stereo.evaluation.perturbation import add_noise as add_noise
     from tensor_stereo.evaluation.perturbation import inject_outliers as inject_outliers
+    from tensor_stereo.evaluation.rows import ROW_SCHEMA as ROW_SCHEMA
     from tensor_stereo.evaluation.sparsification import sparsification_area as sparsification_area
     from tensor_stereo.evaluation.sparsification import sparsification_curve as sparsification_curve
     from tensor_stereo.evaluation.trials import Trial as Trial
@@ -35,7 +35,7 @@ __getattr__, __dir__, __all__ = attach(
         "Confusion": "metrics",
         "MatchRates": "metrics",
         "PairEvaluation": "dataset",
-        "ROW_SCHEMA": "dataset",
+        "ROW_SCHEMA": "rows",
         "Rates": "metrics",
         "ScoreCounts": "metrics",
         "Trial": "trials",

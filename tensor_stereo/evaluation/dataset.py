@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,69 +11,12 @@ import polars as pl
 import torch
 from torch.utils.data import Dataset
 
-from tensor_stereo.configs import ConsensusConfig, Detector, EvaluationConfig, SGBMConfig, SweepConfig
+from tensor_stereo.configs import Detector, EvaluationConfig, SweepConfig
 from tensor_stereo.evaluation.metrics import IsolatedCounts, isolated_update
-from tensor_stereo.evaluation.trials import STAGES, Trial, TrialRunner
+from tensor_stereo.evaluation.rows import ROW_SCHEMA
+from tensor_stereo.evaluation.trials import Trial, TrialRunner
 from tensor_stereo.objects import isolated_matches
 from tensor_stereo.types import StereoPair
-
-_COLUMN_TYPES = {bool: pl.Boolean, int: pl.Int32, float: pl.Float64, str: pl.String}
-ROW_SCHEMA: dict[str, Any] = {
-    "trial": pl.Int32,  # number of the setting in the configuration
-    "dataset": pl.String,
-    "scene": pl.String,
-    "detector": pl.String,
-    "feature_backend": pl.String,  # null where the detector has one implementation
-    "method": pl.String,  # of matching: ssd or sgbm
-    "window_px": pl.Int32,  # null where no image windows are compared by SSD
-    "max_ratio": pl.Float64,  # null: no ratio test; so for every gate
-    "mutual": pl.Boolean,
-    "max_row_offset_px": pl.Float64,
-    "min_disparity_px": pl.Float64,
-    "max_disparity_px": pl.Float64,
-    **{f"sgbm_{name}": _COLUMN_TYPES[type(value)] for name, value in vars(SGBMConfig()).items()},  # of sgbm, else null
-    "variant": pl.String,  # unconstrained, or constrained: Restriction 3
-    "repair": pl.Boolean,
-    "refine": pl.Boolean,
-    "verdict": pl.String,  # score, adjacency or cardinality
-    "min_group_size": pl.Int32,
-    "tie_tolerance": pl.Float64,
-    "outlier_rate": pl.Float64,
-    "noise_px": pl.Float64,
-    "seed": pl.Int64,
-    "score": pl.String,  # the one that was computed, or none
-    "rectified": pl.String,  # true, false or auto; null where the score does not ask
-    "temperature": pl.Float64,  # of the score topology, else null
-    "temperature_unit": pl.String,
-    **{  # of the score consensus, else null
-        f"consensus_{f.name}": pl.Int32 if f.name == "num_rounds" else pl.Float64 for f in fields(ConsensusConfig)
-    },
-    "threshold": pl.Float64,  # one of these three at most, under the verdict score
-    "target_sensitivity": pl.Float64,
-    "min_precision": pl.Float64,
-    "max_error_px": pl.Float64,  # of a correct match; the score is the probability of it
-    "num_matches": pl.Int64,
-    "num_valid": pl.Int64,  # ground truth is known
-    "num_untested": pl.Int64,  # among all matches
-    "true_positive": pl.Int64,  # incorrect and rejected
-    "false_positive": pl.Int64,  # correct and rejected
-    "true_negative": pl.Int64,  # correct and kept
-    "false_negative": pl.Int64,  # incorrect and kept
-    "fraction_incorrect": pl.Float64,  # of the valid ones; NaN where undefined, so for every rate
-    "sensitivity": pl.Float64,  # incorrect matches rejected
-    "specificity": pl.Float64,  # correct matches kept
-    "ppv": pl.Float64,
-    "npv": pl.Float64,
-    "precision": pl.Float64,  # of the kept matches, those that are correct: npv
-    "recall": pl.Float64,  # of the correct matches, those that are kept: specificity
-    "auc": pl.Float64,  # of the score; null without score, so for the next three
-    "specificity_at_sensitivity_96": pl.Float64,
-    "score_counts_correct": pl.List(pl.Int64),  # 128 equal bins of [0, 1]; they add up over pairs
-    "score_counts_incorrect": pl.List(pl.Int64),
-    "domain": pl.String,  # why the score may be far off, empty if it may not; null where it is no probability
-    "is_rectified": pl.Boolean,  # what the score took the pair for; null where it does not ask
-    "seconds": pl.Struct(dict.fromkeys(STAGES, pl.Float64)),  # wall time by stage, also where it was shared
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.classification import classify_graphs
-from tensor_stereo.configs import CUTS, TrialConfig
+from tensor_stereo.configs import TrialConfig
 from tensor_stereo.dense.semi_global import match_keypoints
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, confusion_update, roc_update
 from tensor_stereo.evaluation.perturbation import add_noise, inject_outliers
+from tensor_stereo.evaluation.rows import SCORE_BINS, STAGES, setting_columns, stage_keys
 from tensor_stereo.evaluation.truth import errors_against_gt
 from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
-from tensor_stereo.pipeline import STAGES as PIPELINE_STAGES
 from tensor_stereo.pipeline import (
     Judged,
     Stopwatch,
@@ -33,8 +33,6 @@ from tensor_stereo.pipeline import (
 from tensor_stereo.scores.domain import describe_domain
 from tensor_stereo.types import Classification, Features, Matches, Relation, StereoPair
 
-STAGES = (*PIPELINE_STAGES[:2], "perturb", *PIPELINE_STAGES[2:])
-SCORE_BINS = 128  # equal bins of [0, 1] in which the rows count scores
 _OUTDATED = {"graph": ("graph", "relate", "score"), "relate": (), "score": ()}  # what a new result makes useless
 _Result = TypeVar("_Result")
 
@@ -115,84 +113,6 @@ class Trial:
             "score_counts_correct": correct,
             "score_counts_incorrect": incorrect,
         }
-
-
-def setting_columns(config: TrialConfig) -> dict[str, Any]:
-    """The settings of a trial as columns of a row; None where a setting does not apply.
-
-    >>> setting_columns(TrialConfig(detector="sift"))["max_ratio"]
-    0.8
-    >>> [setting_columns(TrialConfig(rectified=kind))["rectified"] for kind in (True, False, "auto")]
-    ['true', 'false', 'auto']
-    """
-    features, score = getattr(config, config.detector), config.resolved_score
-    is_dense = config.matching.method == "sgbm"
-    return {
-        "detector": config.detector,
-        "feature_backend": getattr(features, "backend", None),
-        "method": config.matching.method,
-        "window_px": None if is_dense else getattr(features, "window_px", None),
-        "max_ratio": config.resolved_matching.max_ratio,
-        "mutual": config.matching.mutual,
-        "max_row_offset_px": None if is_dense else config.matching.max_row_offset_px,
-        "min_disparity_px": config.matching.min_disparity_px,
-        "max_disparity_px": config.matching.max_disparity_px,
-        **{f"sgbm_{name}": value if is_dense else None for name, value in vars(config.sgbm).items()},
-        "variant": "constrained" if config.constrained else "unconstrained",
-        "repair": config.repair,
-        "refine": config.refine,
-        "verdict": config.verdict,
-        "min_group_size": config.min_group_size,
-        "tie_tolerance": config.tie_tolerance,
-        "outlier_rate": config.outlier_rate,
-        "noise_px": config.noise_px,
-        "seed": config.seed,
-        "score": score,
-        "rectified": str(config.rectified).lower() if config.is_probability else None,
-        "temperature": config.temperature if score == "topology" else None,
-        "temperature_unit": config.temperature_unit if score == "topology" else None,
-        **{
-            f"consensus_{name}": value if score == "consensus" else None
-            for name, value in vars(config.consensus).items()
-        },
-        **{name: getattr(config, name) for name in CUTS},
-        "max_error_px": config.max_error_px,
-    }
-
-
-def stage_keys(trial: TrialConfig) -> dict[str, Hashable]:
-    """What the result of each stage depends on; trials with equal keys share it.
-
-    >>> trial = TrialConfig()
-    >>> keys, other = stage_keys(trial), stage_keys(replace(trial, verdict="adjacency"))
-    >>> [stage for stage in STAGES if keys[stage] != other[stage]]
-    ['relate', 'score']
-    """
-    features = getattr(trial, trial.detector)
-    if trial.detector == "sift":
-        features = replace(features, max_ratio=None)  # a setting of the matcher
-    keys: dict[str, Hashable] = {"detect": (trial.detector, features)}
-    if trial.matching.method == "sgbm":
-        keys["disparity"] = trial.sgbm  # of the images alone
-        keys["match"] = keys["detect"], trial.matching, trial.sgbm
-    else:
-        keys["match"] = keys["detect"], trial.resolved_matching, trial.backend
-    keys["perturb"] = keys["match"], trial.outlier_rate, trial.noise_px, trial.seed
-    if trial.constrained:
-        keys["label"] = trial.objects  # of the images alone
-    keys["group"] = keys["perturb"], trial.objects if trial.constrained else None
-    keys["graph"] = keys["group"], trial.tie_tolerance, trial.backend
-    keys["relate"] = keys["graph"], trial.verdict == "adjacency", trial.min_group_size
-    used = {
-        "topology": (trial.temperature, trial.temperature_unit),
-        "consensus": (trial.consensus, trial.rectified),
-        "learned": trial.rectified,
-    }
-    keys["score"] = keys["graph"], trial.resolved_score, used.get(trial.resolved_score)
-    decides = trial.verdict, *(getattr(trial, name) for name in CUTS), trial.max_error_px
-    asked = trial.repair, trial.refine
-    keys["improve"] = (keys["relate"], keys["score"], decides, asked) if any(asked) else None
-    return keys
 
 
 class TrialRunner:

@@ -10,7 +10,7 @@ import polars as pl
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import PairFiles
-from tensor_stereo.evaluation.trials import STAGES, stage_keys
+from tensor_stereo.evaluation.rows import STAGES, stage_keys
 
 
 class Task(NamedTuple):

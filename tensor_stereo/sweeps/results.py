@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.configs import SweepConfig
-from tensor_stereo.evaluation.trials import setting_columns
+from tensor_stereo.evaluation.rows import setting_columns
 from tensor_stereo.sweeps.grid import expand_grid
 from tensor_stereo.sweeps.journal import read_journals
 from tensor_stereo.sweeps.store import MATCHES_SCHEMA, METRICS_SCHEMA, errors_table, read_config_file

@@ -29,7 +29,7 @@ import polars as pl
 
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.configs import TrialConfig
-from tensor_stereo.evaluation.dataset import ROW_SCHEMA
+from tensor_stereo.evaluation.rows import ROW_SCHEMA
 from tensor_stereo.sweeps.journal import append, enter, is_open_elsewhere, open_journal, read_journals, run_lock
 from tensor_stereo.sweeps.units import UnitResult
 from tensor_stereo.table_files import write_table

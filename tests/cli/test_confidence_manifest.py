@@ -52,7 +52,8 @@ def test_each_pair_gives_what_it_gives_alone(listed: Path, tmp_path: Path, capsy
     out = tmp_path / "out"
     main(["confidence", str(listed), "--out", str(out), "--min-precision", "0.9", "--ending", ".npy", "--stride", "2"])
     printed = capsys.readouterr().out
-    assert "| one " in printed and "| all " in printed and str(out / "confidence.parquet") in printed
+    for text in ("| one ", "| all ", str(out / "confidence.parquet")):
+        assert text in printed
     frame = pl.read_parquet(out / "confidence.parquet")
     assert frame.select("dataset", "scene").rows() == [("one", "a b"), ("two", "deep/c"), ("two", "d")]
     settings = {"stride": 2, "min_precision": 0.9}
@@ -100,7 +101,8 @@ def test_it_goes_on_where_it_was(listed: Path, tmp_path: Path, capsys: pytest.Ca
         main(["confidence", str(manifest), "--out", str(out)])
     assert stop.value.code == 1
     captured = capsys.readouterr()
-    assert "two/d: disparity_est: there is no file" in captured.err and "1 of 3 pairs failed" in captured.err
+    for text in ("two/d: disparity_est: there is no file", "1 of 3 pairs failed"):
+        assert text in captured.err
     assert len(pl.read_parquet(out / "confidence.parquet")) == 2
     (tmp_path / "away.pfm").rename(hidden)
     summary = confidence_folder.score_disparity_manifest(manifest, out)
@@ -108,7 +110,7 @@ def test_it_goes_on_where_it_was(listed: Path, tmp_path: Path, capsys: pytest.Ca
     (out / "one" / "a b.png").unlink()
     hidden.write_bytes((tmp_path / "map0.pfm").read_bytes())
     assert confidence_folder.score_disparity_manifest(manifest, out).num_found == 1
-    with pytest.raises(ValueError, match="out: .* holds results of other settings"):
+    with pytest.raises(ValueError, match="holds results of other settings"):
         confidence_folder.score_disparity_manifest(manifest, out, stride=2)
 
 

@@ -11,8 +11,8 @@ import torch
 from tensor_stereo.configs import RESTRICTIONS, EvaluationConfig, SweepConfig, TrialConfig, Verdict
 from tensor_stereo.datasets import PairDataset, find_pairs
 from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
-from tensor_stereo.evaluation.dataset import ROW_SCHEMA, evaluate_pair, score_dataset
-from tensor_stereo.evaluation.trials import STAGES
+from tensor_stereo.evaluation.dataset import evaluate_pair, score_dataset
+from tensor_stereo.evaluation.rows import ROW_SCHEMA, STAGES
 from tensor_stereo.reports.tables import RATES, rates_table
 from tests.test_pipeline import EIGHT
 

@@ -23,9 +23,9 @@ from tensor_stereo.configs import (
 )
 from tensor_stereo.datasets.synthetic.rendering import render_pair
 from tensor_stereo.evaluation import trials
-from tensor_stereo.evaluation.dataset import ROW_SCHEMA
 from tensor_stereo.evaluation.metrics import roc_auc, specificity_at_sensitivity
-from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES, TrialRunner, stage_keys
+from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES, stage_keys
+from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.evaluation.truth import matches_against_gt
 from tensor_stereo.modules import DelaunayFilter
 from tensor_stereo.ops import backends

@@ -16,9 +16,8 @@ import torch
 from PIL import Image
 
 from tensor_stereo.configs import ConsensusConfig, SGBMConfig
-from tensor_stereo.evaluation.dataset import ROW_SCHEMA
 from tensor_stereo.evaluation.metrics import confusion_update, roc_update
-from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES
+from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES
 from tensor_stereo.reports.sweep.results import ERROR_COLUMNS, Overlay, RunResults
 
 SCENES = ("Art", "Books", "Cones", "Dolls", "Laundry", "Moebius", "Reindeer", "Teddy")

@@ -9,8 +9,7 @@ import polars as pl
 import pytest
 
 from tensor_stereo.configs import TrialConfig
-from tensor_stereo.evaluation.dataset import ROW_SCHEMA
-from tensor_stereo.evaluation.trials import SCORE_BINS, STAGES, setting_columns
+from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES, setting_columns
 from tensor_stereo.reports.sweep.curves import detector_curves
 from tensor_stereo.reports.sweep.pooling import (
     CELLS,

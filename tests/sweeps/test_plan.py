@@ -7,7 +7,8 @@ import pytest
 from tensor_stereo.configs import VERDICTS, SweepConfig, TrialConfig
 from tensor_stereo.datasets import PairFiles
 from tensor_stereo.datasets.synthetic.rendering import render_pair
-from tensor_stereo.evaluation.trials import STAGES, TrialRunner
+from tensor_stereo.evaluation.rows import STAGES
+from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.sweeps import Plan, build_plan, expand_grid
 
 GRID = {

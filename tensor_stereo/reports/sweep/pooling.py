@@ -12,7 +12,7 @@ import torch
 
 from tensor_stereo.configs import DETECTORS, ConsensusConfig, SGBMConfig
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, Confusion, ScoreCounts
-from tensor_stereo.evaluation.trials import SCORE_BINS
+from tensor_stereo.evaluation.rows import SCORE_BINS
 from tensor_stereo.reports.sweep.results import COUNTS
 
 

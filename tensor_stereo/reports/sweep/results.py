@@ -8,8 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from tensor_stereo.evaluation.dataset import ROW_SCHEMA
-from tensor_stereo.evaluation.trials import SCORE_BINS
+from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS
 
 RESULT_COLUMNS = ("unit", *ROW_SCHEMA, "host")
 ERROR_COLUMNS = ("unit", "dataset", "scene", "detector", "stage", "error", "message", "attempts")

@@ -47,6 +47,19 @@ def read_parquet(path: Path) -> pl.DataFrame:
             raise ValueError(f"{path} is no readable Parquet file: {_one_line(error)}") from error
 
 
+def lazy_parquet(path: Path) -> pl.LazyFrame:
+    """A Parquet file as a lazy table, after the same checks as by :func:`read_parquet`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is damaged, or has more than ``MAX_ROWS`` rows.
+    """
+    path.open("rb").close()
+    check_name(path)
+    _DECODER.check(path)
+    return pl.scan_parquet(path.absolute(), glob=False, hive_partitioning=False)
+
+
 def scan_parquet(paths: Sequence[Path], schema: dict[str, Any]) -> pl.LazyFrame:
     """Parquet files of our own as one lazy table; columns of ``schema`` that a file lacks are null."""
     if not paths:
@@ -212,9 +225,9 @@ for line in sys.stdin:
         with open(path, "rb") as file:
             table = pl.scan_parquet(file, glob=False, hive_partitioning=False)
             answer["num_rows"] = table.select(pl.len()).collect().item()
-            if answer["num_rows"] <= max_rows:
-                file.seek(0)
-                pl.read_parquet(file, glob=False, hive_partitioning=False)
+        if answer["num_rows"] <= max_rows:
+            for batch in pl.scan_parquet(path, glob=False, hive_partitioning=False).collect_batches(chunk_size=1 << 16):
+                pass
     except BaseException as error:
         answer["error"] = " ".join(str(error).strip().split("\\n", 1)[0].split())
     print(json.dumps(answer), flush=True)

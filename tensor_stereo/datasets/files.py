@@ -17,6 +17,9 @@ GT_ENCODINGS = ("scaled", "sintel", "flyingthings3d-subset")
 # Of views. The first that is there is taken; ground truth is never JPEG or WebP, which lose values.
 IMAGE_ENDINGS = (".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
 SAMPLE_BITS = Within(8, 16)
+ESTIMATES = ("disparity_est", "disparity1_est")
+PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration", *ESTIMATES)  # of PairFiles
+SCALES = ("gt_scale", "est_scale")
 
 MAX_DEPTH = 6  # data/middlebury/scenes2005/FullSize/zip-2views/Art, with one level to spare
 _SKIPPED = re.compile(r"\..*|__MACOSX|Illum\d+", re.IGNORECASE)  # Illum: the same scene under other lights (2005, 2006)

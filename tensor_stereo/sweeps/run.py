@@ -23,7 +23,7 @@ import torch
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import read_manifest
-from tensor_stereo.datasets.manifest import OPTIONAL
+from tensor_stereo.datasets.pair_table import OPTIONAL
 from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.scores.domain import DomainWarning
 from tensor_stereo.sweeps.engines import Engine, LocalEngine, Outcome

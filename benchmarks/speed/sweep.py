@@ -20,9 +20,11 @@ import polars as pl
 
 from tensor_stereo.configs import SweepConfig, TrialConfig
 from tensor_stereo.datasets import build_manifest, read_manifest, write_manifest, write_synthetic
+from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.sweeps import SweepProgress, build_plan, run_sweep
-from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
-from tensor_stereo.sweeps.units import UnitResult, run_tasks
+from tensor_stereo.sweeps.batches import METRICS_SCHEMA, make_batch
+from tensor_stereo.sweeps.store import RunStore
+from tensor_stereo.sweeps.units import run_tasks
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.harness import Suite
@@ -111,9 +113,10 @@ def main() -> None:
         shutil.rmtree(folder / "run")
         run_sweep(CONFIG, many, folder / "run", limit=0)
         known = json.loads((folder / "run" / "config.json").read_text())
-        with RunStore(folder / "run", known, pl.read_parquet(many)) as store:
-            for unit in range(10_000):
-                store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0}]))
+        row = dict.fromkeys(METRICS_SCHEMA) | {"trial": 0}
+        with RunStore(folder / "run", known, PairTable(many, check_files=False)) as store:
+            for first in range(0, 10_000, 100):
+                store.add(make_batch([row | {"unit": unit} for unit in range(first, first + 100)]))
         (folder / "sweep.toml").write_text("[grid]\n" + "".join(f'{k} = "{v}"\n' for k, v in SETTINGS.items()))
         command = [sys.executable, "-P", "-m", "tensor_stereo", "sweep", str(folder / "sweep.toml")]
         command += ["--manifest", str(many), "--out", str(folder / "run")]

@@ -40,7 +40,7 @@ from training.train_confidence import (
     record_scene,
 )
 
-CROP = (64, 128)
+CROP = (48, 96)
 _REACH = 4  # px of a patch around its centre
 _UNIT_PX = 64.0  # of the disparities that it sees
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 
 from tensor_stereo.cli.checks import parse_shard
 from tensor_stereo.cli.commands import Sweep
 from tensor_stereo.cli.endings import INTERRUPTED, OK, fail, most_frequent
 from tensor_stereo.cli.progress import describe_time, show_progress
-from tensor_stereo.datasets import read_manifest
+from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.evaluation.rows import STAGES
-from tensor_stereo.sweeps import SweepProgress, build_plan, read_errors, read_grid, read_results, run_sweep
+from tensor_stereo.sweeps import SweepProgress, build_plan, read_errors, read_grid, run_sweep
 from tensor_stereo.sweeps.plan import Plan
-from tensor_stereo.sweeps.run import check_trials
-from tensor_stereo.sweeps.units import run_tasks
+from tensor_stereo.sweeps.results import has_ground_truth
 
 
 def run_sweep_command(command: Sweep) -> int:
@@ -23,7 +21,7 @@ def run_sweep_command(command: Sweep) -> int:
     config = read_grid(command.settings)
     shard = parse_shard(command.shard)
     if command.dry_run:
-        print_plan(build_plan(config, read_manifest(command.manifest, check_files=False)), shard)
+        print_plan(build_plan(config, PairTable(command.manifest, check_files=False)), shard)
         return OK
     with show_progress("sweep") as show:
         summary = run_sweep(
@@ -50,19 +48,15 @@ def run_sweep_command(command: Sweep) -> int:
     if end.num_failed:
         reasons = read_errors(command.out)["message"].to_list()
         return fail(f"{end.num_failed} of {end.num_units} units failed: {most_frequent(reasons)}")
-    if end.num_done == end.num_units and not config.export_matches and not _has_ground_truth(command.out):
+    if end.num_done == end.num_units and not config.export_matches and not has_ground_truth(command.out):
         return fail("no pair has known ground truth, so there are no rates; matches come with export_matches = true")
     return OK
 
 
-def _has_ground_truth(run: Path) -> bool:
-    """Whether any match of a run has known ground truth; True of a run without rows."""
-    counts = read_results(run)["num_valid"]
-    return counts.is_empty() or bool((counts > 0).any())
-
-
 def print_plan(plan: Plan, shard: tuple[int, int]) -> None:
     """Print what a sweep would run, how stages are shared, and what a unit takes, timed on one pair."""
+    from tensor_stereo.sweeps.units import check_trials, run_tasks
+
     units = plan.shard(*shard)
     check_trials(plan.config)
     num_pairs = len(units) // len(plan.groups)
@@ -73,11 +67,11 @@ def print_plan(plan: Plan, shard: tuple[int, int]) -> None:
     widths = {"features": 8, "detector": 8, "trials": 6, **dict.fromkeys(STAGES, 7), "seconds": 8}
     print("  ".join(f"{name:>{width}}" for name, width in widths.items()))
     total = 0.0
-    pair = units[len(units) // 2] // len(plan.groups)
+    pair = int(units[len(units) // 2]) // len(plan.groups)
     for number, row in enumerate(plan.costs().iter_rows(named=True)):
         start = time.perf_counter()  # the libraries are warm: check_trials has run every point
-        (result,) = run_tasks(plan.config, [plan.task(pair * len(plan.groups) + number)])
-        seconds = math.nan if result.error else time.perf_counter() - start
+        result = run_tasks(plan.config, [plan.task(pair * len(plan.groups) + number)])
+        seconds = math.nan if result.errors else time.perf_counter() - start
         total += seconds
         print(
             "  ".join(f"{row[name]:>{width}}" for name, width in widths.items() if name != "seconds"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import bisect
+import filecmp
 import math
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,6 +97,20 @@ class PairTable:
         """All rows, with the columns of ``SCHEMA``."""
         return pl.concat([part.rows for part in self._parts]) if self._parts else pl.LazyFrame(schema=SCHEMA)
 
+    def copy_to(self, path: Path) -> None:
+        """Write all rows as one Parquet file.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        if len(self._parts) == 1 and has_ending(self._parts[0].path, ".parquet"):
+            shutil.copyfile(self._parts[0].path, path)
+            return
+        try:
+            self.rows().sink_parquet(path)
+        except pl.exceptions.PolarsError as error:
+            raise OSError(f"{path} cannot be written: {error}") from error
+
     def find(self, dataset: str, scene: str) -> PairFiles:
         """The pair of a name.
 
@@ -106,13 +122,20 @@ class PairTable:
             raise KeyError(f"{self.path} has no pair {dataset}/{scene}")
         return to_pair(rows.row(0, named=True))
 
-    def first_difference(self, other: PairTable) -> str | None:
-        """What differs first from another manifest, in words; None if they say the same."""
-        if len(self) != len(other):
-            return f"it has {len(other)} pairs there, {len(self)} here"
-        for (first, here), (_, there) in zip(
-            windows(self.rows(), len(self)), windows(other.rows(), len(self)), strict=True
-        ):
+    def first_difference(self, other: Path) -> str | None:
+        """What differs first from the manifest in another file, in words; None if both say the same.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is no manifest.
+        """
+        if len(self._parts) == 1 and filecmp.cmp(self._parts[0].path, other, shallow=False):
+            return None
+        table = PairTable(other, check_files=False)
+        if len(self) != len(table):
+            return f"it has {len(table)} pairs there, {len(self)} here"
+        both = zip(windows(self.rows(), len(self)), windows(table.rows(), len(self)), strict=True)
+        for (first, here), (_, there) in both:
             if not here.equals(there):
                 row = next(k for k, (a, b) in enumerate(zip(here.rows(), there.rows(), strict=True)) if a != b)
                 name = next(name for name in SCHEMA if here[name][row] != there[name][row])
@@ -168,7 +191,7 @@ def _files(path: Path, check_files: bool) -> Iterator[tuple[Path, pl.LazyFrame]]
     for file in files:
         if has_ending(file, ".csv"):
             rows = [pair_row(pair) | {"width_px": 1, "height_px": 1} for pair in read_list(file, check_files)]
-            yield file, pl.LazyFrame(rows, schema=SCHEMA)
+            yield file, pl.DataFrame(rows, schema=SCHEMA).lazy()
         else:
             yield file, _complete(file, lazy_parquet(file))
 

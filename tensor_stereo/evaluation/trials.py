@@ -21,6 +21,7 @@ from tensor_stereo.graphs import MatchGraphs, build_match_graphs
 from tensor_stereo.matching import match_features
 from tensor_stereo.objects import group_matches, label_objects
 from tensor_stereo.pipeline import (
+    ImagePair,
     Judged,
     Stopwatch,
     detect_pairs,
@@ -35,6 +36,7 @@ from tensor_stereo.types import Classification, Features, Matches, Relation, Ste
 
 _OUTDATED = {"graph": ("graph", "relate", "score"), "relate": (), "score": ()}  # what a new result makes useless
 _Result = TypeVar("_Result")
+Detect = Callable[[ImagePair, TrialConfig], tuple[tuple[Features, Features], float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,7 @@ class TrialRunner:
 
     Args:
         pair: images, with or without ground truth.
+        detect: What gives the features of both grey views, and the seconds that they took; None: they are detected.
 
     Example:
         >>> from tensor_stereo.datasets.synthetic.rendering import render_pair
@@ -132,8 +135,9 @@ class TrialRunner:
         True
     """
 
-    def __init__(self, pair: StereoPair) -> None:
+    def __init__(self, pair: StereoPair, detect: Detect | None = None) -> None:
         self.pair = pair
+        self._detect = detect
         self.stage = "read"  # under way, for whoever reports an error
         self._gray = to_gray_pairs([(pair.image0, pair.image1)])
         self._held: dict[str, dict[Hashable, tuple[Any, float]]] = {}
@@ -162,7 +166,11 @@ class TrialRunner:
             result, seconds[stage] = held[keys[stage]]
             return result
 
-        features = share("detect", lambda: detect_pairs(self._gray, trial))
+        detect = self._detect
+        if detect is None:
+            features = share("detect", lambda: detect_pairs(self._gray, trial))
+        else:
+            features, seconds["detect"] = share("detect", lambda: detect(self._gray[0], trial))
         if trial.matching.method == "sgbm":
             maps = share("disparity", lambda: map_pairs(self._gray, trial))
             putative = share("match", lambda: match_keypoints(features[0], maps, trial.matching))

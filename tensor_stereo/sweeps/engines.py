@@ -1,4 +1,4 @@
-"""Where tasks run: one interface, and worker processes on this machine."""
+"""Where tasks run: one interface, and worker processes on this machine. Imports no torch."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -16,17 +17,17 @@ from multiprocessing.process import BaseProcess
 from typing import NamedTuple, Protocol
 
 from tensor_stereo.configs import SweepConfig
+from tensor_stereo.sweeps.batches import BatchResult
 from tensor_stereo.sweeps.journal import SweepError
 from tensor_stereo.sweeps.plan import Task
-from tensor_stereo.sweeps.units import UnitResult, run_tasks
 from tensor_stereo.waiting import passive_children
 
 
 class Outcome(NamedTuple):
-    """What an engine says of a batch; ``results`` is None if its worker died."""
+    """What an engine says of a batch; ``result`` is None if its worker died."""
 
     tasks: tuple[Task, ...]
-    results: list[UnitResult] | None
+    result: BatchResult | None
 
 
 class Engine(Protocol):
@@ -50,6 +51,39 @@ class Engine(Protocol):
 
 class WorkerStartError(SweepError):
     """No worker comes to life."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a worker process ended before it began; what it said stands above. A script that runs a sweep must be a "
+            'file and do so below: if __name__ == "__main__"'
+        )
+
+
+def run_batch(config: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
+    """Run the units of a batch in this process, which loads torch."""
+    from tensor_stereo.sweeps.units import run_tasks
+
+    return run_tasks(config, tasks)
+
+
+def check_points(config: SweepConfig) -> None:
+    """Run every point of a grid once, in a process of its own.
+
+    Raises:
+        ValueError: for a bad setting, naming the point.
+        WorkerStartError: if the process does not come to life.
+    """
+    with passive_children(), ProcessPoolExecutor(1, mp_context=_context()) as pool:
+        try:
+            pool.submit(_check_points, config).result()
+        except BrokenExecutor:
+            raise WorkerStartError from None
+
+
+def _check_points(config: SweepConfig) -> None:
+    from tensor_stereo.sweeps.units import check_trials
+
+    check_trials(config)
 
 
 @dataclass
@@ -99,10 +133,7 @@ class LocalEngine:
             except (EOFError, OSError):  # also in the middle of a message
                 self._bury(connection)
                 if not worker.has_begun:
-                    raise WorkerStartError(
-                        "a worker process ended before it began; what it said stands above. A script that runs a sweep "
-                        'must be a file and do so below: if __name__ == "__main__"'
-                    ) from None
+                    raise WorkerStartError from None
                 if worker.tasks:
                     outcomes.append(Outcome(worker.tasks, None))
                 self._start_worker()
@@ -164,7 +195,7 @@ def _work(connection: Connection, config: SweepConfig) -> None:
             tasks = connection.recv()
         except (EOFError, OSError):
             return
-        connection.send(run_tasks(config, tasks))
+        connection.send(run_batch(config, tasks))
 
 
 def _end_with_parent() -> None:

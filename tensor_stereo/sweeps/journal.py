@@ -5,16 +5,65 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tensor_stereo.atomic import append_line, drop_torn_line
 from tensor_stereo.locks import lock
 
 LOG = logging.getLogger(__name__)
+
+
+class UnitSet:
+    """Numbers of units, one byte for each up to the largest.
+
+    >>> units = UnitSet([4, 1, 2])
+    >>> units.runs(), 1 in units, len(units)
+    ([[1, 3], [4, 5]], True, 3)
+    """
+
+    def __init__(self, units: Iterable[int] = ()) -> None:
+        self._there = np.zeros(0, np.bool_)
+        self.add_runs([int(unit), int(unit) + 1] for unit in units)
+
+    def add_runs(self, runs: Iterable[Sequence[int] | int]) -> None:
+        """Add numbers, or runs of them (first, last + 1)."""
+        for run in runs:
+            first, end = (run, run + 1) if isinstance(run, int) else run
+            if not 0 <= first <= end:
+                raise ValueError(f"units must be numbers or runs of them, got {run}")
+            if end > len(self._there):
+                grown = np.zeros(max(end, 2 * len(self._there)), np.bool_)
+                grown[: len(self._there)] = self._there
+                self._there = grown
+            self._there[first:end] = True
+
+    def among(self, units: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) which of some units are in the set."""
+        found = np.zeros(len(units), np.bool_)
+        within = units < len(self._there)
+        found[within] = self._there[units[within]]
+        return found
+
+    def runs(self) -> list[list[int]]:
+        """The numbers as runs (first, last + 1)."""
+        edges = np.flatnonzero(np.diff(self._there, prepend=False, append=False))
+        return edges.reshape(-1, 2).tolist()
+
+    def __contains__(self, unit: int) -> bool:
+        return unit < len(self._there) and bool(self._there[unit])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(np.flatnonzero(self._there).tolist())
+
+    def __len__(self) -> int:
+        return int(self._there.sum())
 
 
 @dataclass
@@ -28,15 +77,18 @@ class JournalState:
         names: paths of all parts that were ever finished, also damaged and missing ones.
     """
 
-    good: set[int] = field(default_factory=set)
+    good: UnitSet = field(default_factory=UnitSet)
     errors: dict[int, dict[str, Any]] = field(default_factory=dict)
     files: dict[str, tuple[int, str]] = field(default_factory=dict)
     names: set[str] = field(default_factory=set)
 
-    @property
-    def done(self) -> set[int]:
-        """Units that are not to be done again."""
-        return self.good | self.errors.keys()
+    def done(self, units: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) which of some units are not to be done again: the good ones and those that failed."""
+        return self.good.among(units) | self.failed(units)
+
+    def failed(self, units: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(N,) which of some units failed."""
+        return np.isin(units, np.fromiter(self.errors, np.int64, len(self.errors)))
 
 
 class SweepError(RuntimeError):
@@ -55,7 +107,7 @@ def read_journals(out: Path, *, verify: bool = False) -> JournalState:
         verify: read and hash the files instead of asking for their size.
     """
     state = JournalState()
-    lost: set[int] = set()
+    lost = UnitSet()
     for path in sorted(out.glob("journal-*.jsonl")):
         for line in path.read_bytes().splitlines():
             try:
@@ -72,11 +124,11 @@ def read_journals(out: Path, *, verify: bool = False) -> JournalState:
                 LOG.warning("%s is damaged; its units are done again", name)
             state.names |= entry["files"].keys()  # a name is never used twice
             if damaged:
-                lost |= set(entry["done"])
+                lost.add_runs(entry["done"])
                 entry = entry | {"files": {}, "done": []}
             enter(entry, state)
-    for unit in lost - state.good:  # they were good, so an older error does not count
-        state.errors.pop(unit, None)
+    for unit in [unit for unit in state.errors if unit in lost]:  # it was good, so an older error does not count
+        del state.errors[unit]
     return state
 
 
@@ -84,9 +136,11 @@ def enter(entry: dict[str, Any], state: JournalState) -> None:
     """Enter one line of a journal, in any order: a unit with rows is good, whatever else was said of it."""
     state.files.update(entry["files"])
     state.names |= entry["files"].keys()
-    for unit in entry["done"]:
-        state.good.add(unit)
-        state.errors.pop(unit, None)
+    state.good.add_runs(entry["done"])
+    if state.errors:
+        for run in entry["done"]:
+            for unit in [run] if isinstance(run, int) else range(*run):
+                state.errors.pop(unit, None)
     for record in entry["errors"]:
         if record["unit"] not in state.good:
             state.errors[record["unit"]] = record

@@ -1,15 +1,18 @@
-"""What a sweep has to do: units of work and what they cost."""
+"""What a sweep has to do: units of work and what they cost. Imports no torch."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from tensor_stereo.configs import SweepConfig
-from tensor_stereo.datasets import PairFiles
+from tensor_stereo.datasets.files import PairFiles
+from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.evaluation.rows import STAGES, stage_keys
 
 
@@ -22,6 +25,20 @@ class Task(NamedTuple):
     attempt: int = 1
 
 
+def failed_unit(config: SweepConfig, task: Task, stage: str, error: Exception) -> dict[str, Any]:
+    """The record of a unit that raised."""
+    return {
+        "unit": task.unit,
+        "dataset": task.files.dataset,
+        "scene": task.files.scene,
+        "detector": config.trials[task.trials[0]].detector,
+        "stage": stage,
+        "error": type(error).__name__,
+        "message": " ".join(str(error).split()),
+        "attempts": task.attempt,
+    }
+
+
 @dataclass(frozen=True)
 class Plan:
     """The units of a sweep: every pair under every setting of a detector.
@@ -31,13 +48,13 @@ class Plan:
 
     Attributes:
         config: the points of the grid.
-        pairs: the rows of the manifest.
+        pairs: the rows of the manifest, by number.
         groups: numbers of the trials that detect the same features, ordered such that those that share further stages
             follow one another.
     """
 
     config: SweepConfig
-    pairs: tuple[PairFiles, ...]
+    pairs: Sequence[PairFiles] | PairTable
     groups: tuple[tuple[int, ...], ...]
 
     @property
@@ -49,8 +66,8 @@ class Plan:
         pair, group = divmod(unit, len(self.groups))
         return Task(unit, self.pairs[pair], self.groups[group], attempt)
 
-    def shard(self, index: int, count: int) -> range | list[int]:
-        """The units of shard ``index`` of ``count``, from 1; all units of a pair lie in one shard.
+    def shard(self, index: int, count: int) -> NDArray[np.int64]:
+        """The units of shard ``index`` of ``count``, from 1, in order; all units of a pair lie in one shard.
 
         Raises:
             ValueError: unless 1 <= index <= count.
@@ -58,7 +75,8 @@ class Plan:
         if not 1 <= index <= count:
             raise ValueError(f"shard must be i/n with 1 <= i <= n, got {index}/{count}")
         size = len(self.groups)
-        return [p * size + g for p in range(index - 1, len(self.pairs), count) for g in range(size)]
+        pairs = np.arange(index - 1, len(self.pairs), count, dtype=np.int64)
+        return (pairs[:, None] * size + np.arange(size)).ravel()
 
     def costs(self) -> pl.DataFrame:
         """How often each stage runs in the units of each group, and in how many trials its result is used.
@@ -82,7 +100,7 @@ class Plan:
         return pl.DataFrame(rows)
 
 
-def build_plan(config: SweepConfig, pairs: Iterable[PairFiles]) -> Plan:
+def build_plan(config: SweepConfig, pairs: Sequence[PairFiles] | PairTable) -> Plan:
     """Split the points of a sweep into groups that detect the same features.
 
     >>> from tensor_stereo.configs import TrialConfig
@@ -99,4 +117,4 @@ def build_plan(config: SweepConfig, pairs: Iterable[PairFiles]) -> Plan:
     groups: dict[Hashable, list[int]] = {}
     for k in order:
         groups.setdefault(keys[k]["detect"], []).append(k)
-    return Plan(config, tuple(pairs), tuple(map(tuple, groups.values())))
+    return Plan(config, pairs, tuple(map(tuple, groups.values())))

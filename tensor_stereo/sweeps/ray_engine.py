@@ -12,10 +12,21 @@ from collections.abc import Sequence
 from typing import Any
 
 from tensor_stereo.configs import SweepConfig
-from tensor_stereo.sweeps.engines import Outcome
+from tensor_stereo.sweeps.engines import Outcome, run_batch
 from tensor_stereo.sweeps.plan import Task
-from tensor_stereo.sweeps.units import run_tasks
 from tensor_stereo.waiting import chosen_policy
+
+
+def find_ray() -> Any:
+    """The module ``ray``.
+
+    Raises:
+        ImportError: if Ray is not installed.
+    """
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise ImportError("the engine 'ray' needs Ray: pip install 'tensor-stereo[ray]'") from error
 
 
 class RayEngine:
@@ -33,18 +44,14 @@ class RayEngine:
     """
 
     def __init__(self, config: SweepConfig, num_workers: int | None = None, address: str | None = None) -> None:
-        try:
-            self._ray: Any = importlib.import_module("ray")
-        except ImportError as error:
-            raise ImportError("the engine 'ray' needs Ray: pip install 'tensor-stereo[ray]'") from error
-        ray = self._ray
+        self._ray = ray = find_ray()
         self._started = not ray.is_initialized()
         if self._started:
             local = {} if address else {"num_cpus": num_workers, "include_dashboard": False}
             ray.init(address=address or "local", log_to_driver=False, configure_logging=False, **local)
         self.num_workers = num_workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._config = ray.put(config)
-        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": chosen_policy()})(run_tasks)
+        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": chosen_policy()})(run_batch)
         self._running: dict[Any, tuple[Task, ...]] = {}
 
     def submit(self, tasks: Sequence[Task]) -> None:

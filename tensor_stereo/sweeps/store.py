@@ -1,6 +1,6 @@
 """The run folder of a sweep: parts that appear whole, and a journal of those that are finished.
 
-    RUN/config.json          the points of the grid and the fingerprint of the manifest
+    RUN/config.json          the points of the grid
     RUN/manifest.parquet     the pairs
     RUN/environment.json     one record per start: time, host, versions, engine
     RUN/journal-1-of-1.jsonl one line per part: its files with size and hash, the units that it holds
@@ -9,8 +9,9 @@
     RUN/errors.parquet       one row per failed unit
     RUN/log.jsonl            what happened when
 
-A part is written to a temporary file, flushed to disk, renamed, and only then entered in the journal, which is flushed
-too. So a part counts once or not at all, whenever the process ends.
+A part is written when the oldest result in it is ``seconds_per_part`` old, or when it is full: to a temporary file,
+flushed to disk, renamed, and only then entered in the journal, which is flushed too. So a part counts once or not at
+all, whenever the process ends.
 """
 
 from __future__ import annotations
@@ -19,51 +20,34 @@ import hashlib
 import io
 import json
 import logging
+import math
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.configs import TrialConfig
-from tensor_stereo.evaluation.rows import ROW_SCHEMA
-from tensor_stereo.sweeps.journal import append, enter, is_open_elsewhere, open_journal, read_journals, run_lock
-from tensor_stereo.sweeps.units import UnitResult
+from tensor_stereo.datasets.pair_table import PairTable
+from tensor_stereo.sweeps.batches import ERRORS_SCHEMA, BatchResult
+from tensor_stereo.sweeps.journal import (
+    UnitSet,
+    append,
+    enter,
+    is_open_elsewhere,
+    open_journal,
+    read_journals,
+    run_lock,
+)
 from tensor_stereo.table_files import write_table
 
 LOG = logging.getLogger(__name__)
 _MAX_ROWS = 20_000  # that wait for their part, about 80 MB; a hundred matches weigh as much as a row
+_ERRORS_SECONDS = 60.0  # between two writings of the table of errors, which journals hold anyway
 _FOLDERS = ("metrics", "matches")
 FORMAT = 3  # of the run folder; another number when settings or columns are renamed, removed or change their meaning
-METRICS_SCHEMA: dict[str, Any] = {
-    "unit": pl.Int32,  # number of the unit in the plan
-    **ROW_SCHEMA,
-    "host": pl.String,  # of the worker
-    "attempt": pl.Int32,  # how many workers have tried the unit
-}
-ERRORS_SCHEMA: dict[str, Any] = {
-    "unit": pl.Int32,
-    "dataset": pl.String,
-    "scene": pl.String,
-    "detector": pl.String,
-    "stage": pl.String,  # read, one of the stages of a trial, or worker
-    "error": pl.String,  # name of the exception
-    "message": pl.String,
-    "attempts": pl.Int32,
-}
-MATCHES_SCHEMA: dict[str, Any] = {
-    "unit": pl.Int32,
-    "trial": pl.Int32,
-    **dict.fromkeys(("x0", "y0", "x1", "y1"), pl.Float32),  # px
-    "cost": pl.Float32,
-    "inlier": pl.Boolean,
-    "relation": pl.Int8,  # values of Relation
-    "score": pl.Float32,  # null without score
-    "correct": pl.Boolean,  # null where ground truth is unknown
-}
 
 
 class RunStore:
@@ -72,10 +56,10 @@ class RunStore:
     Args:
         out: the run folder, made if it is not there.
         config: what makes the results what they are, as JSON values; another one is refused.
-        manifest: the pairs, kept beside the results.
+        manifest: the pairs; a copy is kept beside the results, and another one is refused.
         shard: (i, n), the part of the sweep that this process does; every shard has a journal of its own.
         units_per_part: units after which a part is written.
-        seconds_per_part: time after which a part is written, if there is anything to write.
+        seconds_per_part: time after which the oldest result that waits is written; :meth:`flush_if_due` looks.
         verify: hash the finished parts instead of trusting their size.
 
     Raises:
@@ -88,20 +72,21 @@ class RunStore:
         self,
         out: Path,
         config: dict[str, Any],
-        manifest: pl.DataFrame,
+        manifest: PairTable,
         *,
         shard: tuple[int, int] = (1, 1),
         units_per_part: int = 500,
-        seconds_per_part: float = 30.0,
+        seconds_per_part: float = 10.0,
         verify: bool = False,
     ) -> None:
         self.out = out
         self._name = f"{shard[0]}-of-{shard[1]}"
         self._units_per_part = units_per_part
         self._seconds_per_part = seconds_per_part
-        self._pending: list[UnitResult] = []
-        self._num_rows = 0
-        self._flushed_at = time.monotonic()
+        self._pending: list[BatchResult] = []
+        self._num_units = self._num_rows = 0
+        self._oldest = time.monotonic()  # of what waits
+        self._errors_at = -math.inf
         out.mkdir(parents=True, exist_ok=True)
         with run_lock(out):
             _claim(out, config, manifest)
@@ -121,49 +106,62 @@ class RunStore:
     def __exit__(self, *exception: object) -> None:
         try:
             self.flush()
+            self._write_all_errors()
         finally:
             self._journal.close()
 
-    def add(self, result: UnitResult) -> None:
-        """Take the result of a unit; a full or an old part is written.
+    def add(self, batch: BatchResult) -> None:
+        """Take the results of a batch; a full part is written.
 
         Raises:
             OSError: if the part cannot be written; its results are kept and go with the next one.
         """
-        self._pending.append(result)
-        self._num_rows += len(result.rows) + (0 if result.matches is None else len(result.matches["trial"]) // 100)
-        is_old = time.monotonic() - self._flushed_at > self._seconds_per_part
-        if is_old or len(self._pending) >= self._units_per_part or self._num_rows > _MAX_ROWS:
+        if not self._pending:
+            self._oldest = time.monotonic()
+        self._pending.append(batch)
+        self._num_units += batch.num_units
+        self._num_rows += len(batch.metrics) + (0 if batch.matches is None else len(batch.matches) // 100)
+        if self._num_units >= self._units_per_part or self._num_rows > _MAX_ROWS:
+            self.flush()
+        else:
+            self.flush_if_due()
+
+    def flush_if_due(self) -> None:
+        """Write what is pending if the oldest of it has waited long enough."""
+        if self._pending and time.monotonic() - self._oldest >= self._seconds_per_part:
             self.flush()
 
     def flush(self) -> None:
         """Write what is pending as one part and enter it in the journal."""
         if not self._pending:
             return
-        good = sorted((result for result in self._pending if result.error is None), key=lambda result: result.unit)
-        failed = [result for result in self._pending if result.error is not None]
+        metrics = pl.concat([batch.metrics for batch in self._pending]).sort("unit", "trial")
+        matches = [batch.matches for batch in self._pending if batch.matches is not None]
         files: dict[str, tuple[int, str]] = {}
-        if good:
-            metrics = pl.DataFrame([row for result in good for row in result.rows], METRICS_SCHEMA)
+        if len(metrics):
             tables = {"metrics": metrics}
-            if good[0].matches is not None:
-                tables["matches"] = pl.concat([_match_table(result) for result in good])
+            if matches:
+                tables["matches"] = pl.concat(matches).sort("unit", "trial", maintain_order=True)
             for folder, table in tables.items():
                 path = self.out / folder / f"part-{self._name}-{self._number:06d}.parquet"
                 path.parent.mkdir(exist_ok=True)
                 files[path.relative_to(self.out).as_posix()] = _write_table(table, path)
-        errors = [{"unit": r.unit, **(r.error or {}), "attempts": r.attempt} for r in failed]
-        entry = {"files": files, "done": [result.unit for result in good], "errors": errors}
+        done = UnitSet(unit for batch in self._pending for unit in batch.done).runs()
+        errors = [error for batch in self._pending for error in batch.errors]
+        entry = {"files": files, "done": done, "errors": errors}
         append(entry, self._journal)
         self._pending.clear()
-        failed_before = dict(self.state.errors)
+        failed_before = self.state.errors.keys() | set()
         enter(entry, self.state)
         self._number += 1
-        self._num_rows = 0
-        self._flushed_at = time.monotonic()
-        if self.state.errors != failed_before:
-            with run_lock(self.out):
-                self._write_errors()
+        self._num_units = self._num_rows = 0
+        if self.state.errors.keys() != failed_before and time.monotonic() - self._errors_at > _ERRORS_SECONDS:
+            self._write_all_errors()
+
+    def _write_all_errors(self) -> None:
+        with run_lock(self.out):
+            self._write_errors()
+        self._errors_at = time.monotonic()
 
     def _write_errors(self) -> None:
         """The failed units of all shards, as one table."""
@@ -200,19 +198,7 @@ def _write_table(table: pl.DataFrame, path: Path) -> tuple[int, str]:
     return len(data), hashlib.sha256(data).hexdigest()
 
 
-def _match_table(result: UnitResult) -> pl.DataFrame:
-    if result.matches is None:
-        raise ValueError(f"matches of unit {result.unit} are missing")
-    columns = dict(result.matches)
-    valid = columns.pop("valid")
-    table = pl.DataFrame({"unit": np.full(len(valid), result.unit, np.int32), **columns})
-    table = table.with_columns(
-        pl.col("cost", "score").fill_nan(None), pl.when(pl.Series(valid)).then(pl.col("correct")).alias("correct")
-    )
-    return table.cast(MATCHES_SCHEMA)  # type: ignore[arg-type]
-
-
-def _claim(out: Path, config: dict[str, Any], manifest: pl.DataFrame) -> None:
+def _claim(out: Path, config: dict[str, Any], manifest: PairTable) -> None:
     """Make ``out`` the run of a configuration, or raise if it is that of another one."""
     path = out / "config.json"
     config = json.loads(json.dumps(config))
@@ -221,12 +207,16 @@ def _claim(out: Path, config: dict[str, Any], manifest: pl.DataFrame) -> None:
         if known != config:
             change = _first_difference(known, config, "")
             raise ValueError(f"out: {out} holds results of other settings: {change}; name another folder")
+        difference = manifest.first_difference(out / "manifest.parquet")
+        if difference is not None:
+            raise ValueError(f"out: {out} holds results of another manifest: {difference}; name another folder")
         return
     names = {entry.name for entry in out.iterdir() if not entry.name.startswith(".")}
     others = names - {"manifest.parquet"}  # it comes first, so it is what a start that was killed leaves
     if others:
         raise ValueError(f"out: {out} is no run, but holds {min(others)}; name another folder")
-    _write_table(manifest, out / "manifest.parquet")
+    with whole_file(out / "manifest.parquet") as part:
+        manifest.copy_to(part)
     write_json(config, path)
 
 
@@ -243,6 +233,7 @@ def read_config_file(path: Path) -> dict[str, Any]:
     found = config.get("format")
     if found != FORMAT:
         raise ValueError(f"{path.parent} is a run of format {found}, this release reads format {FORMAT}")
+    config.get("manifest", {}).pop("sha256", None)  # of releases that did not compare the manifest itself
     if "sweep" in config:
         default = json.loads(json.dumps(asdict(TrialConfig())))
         trials = [_complete(trial, default, f"{path.parent}: setting ") for trial in config["sweep"]["trials"]]

@@ -3,49 +3,67 @@
 from __future__ import annotations
 
 import platform
+import time
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
+import polars as pl
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
-from tensor_stereo.configs import SweepConfig
+from tensor_stereo.configs import SweepConfig, TrialConfig
 from tensor_stereo.datasets import PairFiles, read_pair
+from tensor_stereo.evaluation.rows import stage_keys
 from tensor_stereo.evaluation.trials import Trial, TrialRunner
+from tensor_stereo.pipeline import ImagePair, detect_images
 from tensor_stereo.scores.domain import DomainWarning
-from tensor_stereo.sweeps.plan import Task
+from tensor_stereo.sweeps.batches import MATCHES_SCHEMA, BatchResult, make_batch
+from tensor_stereo.sweeps.plan import Task, failed_unit
+from tensor_stereo.types import Features, StereoPair
+
+_IMAGES_HELD = 32  # whose features a worker keeps, for pairs that name them again
 
 
-@dataclass(frozen=True, eq=False)
-class UnitResult:
-    """What became of one unit.
+class FeatureCache:
+    """Features of the images that were last seen, by the files that they come from: each is detected once."""
 
-    Attributes:
-        unit: its number in the plan.
-        rows: one record per trial; empty if the unit failed.
-        error: dataset, scene, detector, stage, error (name of the type) and message of a failure, or None.
-        matches: columns of every match of every trial, if the sweep keeps them.
-        attempt: how many workers have tried, with this one.
-    """
+    def __init__(self) -> None:
+        self._held: OrderedDict[Hashable, tuple[Features, float]] = OrderedDict()
 
-    unit: int
-    rows: list[dict[str, Any]]
-    error: dict[str, str] | None = None
-    matches: dict[str, NDArray[Any]] | None = None
-    attempt: int = 1
+    def detect(self, files: PairFiles, gray: ImagePair, trial: TrialConfig) -> tuple[tuple[Features, Features], float]:
+        """Features of both views, and the seconds that they took when they were detected."""
+        setting = stage_keys(trial)["detect"]
+        views = [(path, files.sample_bits, setting) for path in (files.image0, files.image1)]
+        for view, image in zip(views, gray, strict=True):
+            if view not in self._held:  # each alone, so that no bit depends on which others are held
+                start = time.perf_counter()
+                (features,) = detect_images([image], trial)
+                self._held[view] = features, time.perf_counter() - start
+        (features0, seconds0), (features1, seconds1) = (self._held[view] for view in views)
+        for view in views:
+            self._held.move_to_end(view)
+        while len(self._held) > _IMAGES_HELD:
+            self._held.popitem(last=False)
+        return (features0, features1), seconds0 + seconds1
 
 
-def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> list[UnitResult]:
+_FEATURES = FeatureCache()
+
+
+def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
     """Run units one after another, on one thread; the images of a pair are read once for its consecutive units.
 
-    No exception leaves: a unit that raises becomes a result with an error, and the next one runs.
+    An image that several pairs name is detected once, if not too many others came between. No exception leaves: a unit
+    that raises becomes a record, and the next one runs.
     """
     limit_threads()
-    results = []
+    rows: list[dict[str, Any]] = []
+    errors = []
+    matches: list[pl.DataFrame] = []
     runner: TrialRunner | None = None
     files: PairFiles | None = None
     with warnings.catch_warnings():
@@ -54,24 +72,36 @@ def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> list[UnitResult]:
             try:
                 if runner is None or files != task.files:
                     runner = None  # the last pair's images go before the next ones come
-                    runner, files = TrialRunner(read_pair(task.files)), task.files
-                results.append(_run_unit(config, task, runner))
+                    runner, files = _make_runner(task.files), task.files
+                of_unit, of_matches = _run_unit(config, task, runner)
             except Exception as error:
-                results.append(failed_unit(config, task, runner.stage if runner else "read", error))
-    return results
+                errors.append(failed_unit(config, task, runner.stage if runner else "read", error))
+            else:
+                rows += of_unit
+                matches += of_matches
+    return make_batch(rows, errors, matches if config.export_matches else None)
 
 
-def failed_unit(config: SweepConfig, task: Task, stage: str, error: Exception) -> UnitResult:
-    """The result of a unit that raised."""
-    record = {
-        "dataset": task.files.dataset,
-        "scene": task.files.scene,
-        "detector": config.trials[task.trials[0]].detector,
-        "stage": stage,
-        "error": type(error).__name__,
-        "message": " ".join(str(error).split()),
-    }
-    return UnitResult(task.unit, [], record, attempt=task.attempt)
+def _make_runner(files: PairFiles) -> TrialRunner:
+    pair = read_pair(files)
+    return TrialRunner(pair, detect=lambda gray, trial: _FEATURES.detect(files, gray, trial))
+
+
+def check_trials(config: SweepConfig) -> None:
+    """Run every point once on a small noise image, so that a bad setting is known before a sweep begins.
+
+    Raises:
+        ValueError: naming the point.
+    """
+    noise = torch.randint(0, 256, (1, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    runner = TrialRunner(StereoPair("noise", noise, noise, torch.zeros(64, 64)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DomainWarning)  # noise may be outside of it
+        for number, trial in enumerate(config.trials):
+            try:
+                runner.run(trial)
+            except (ValueError, TypeError, RuntimeError, MemoryError) as error:
+                raise ValueError(f"point {number} of the grid ({trial.detector}): {error}") from error
 
 
 def limit_threads() -> None:
@@ -81,7 +111,7 @@ def limit_threads() -> None:
     cv2.setNumThreads(1)
 
 
-def _run_unit(config: SweepConfig, task: Task, runner: TrialRunner) -> UnitResult:
+def _run_unit(config: SweepConfig, task: Task, runner: TrialRunner) -> tuple[list[dict[str, Any]], list[pl.DataFrame]]:
     rows, tables = [], []
     names = {"dataset": task.files.dataset, "scene": task.files.scene}  # as the manifest has them
     origin = names | {"host": platform.node(), "attempt": task.attempt}
@@ -89,26 +119,30 @@ def _run_unit(config: SweepConfig, task: Task, runner: TrialRunner) -> UnitResul
         trial = runner.run(config.trials[number])
         rows.append({"unit": task.unit, "trial": number} | trial.row() | origin)
         if config.export_matches:
-            tables.append(_match_columns(number, trial))
-    matches = None
-    if tables:
-        matches = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-    return UnitResult(task.unit, rows, matches=matches, attempt=task.attempt)
+            tables.append(_match_table(task.unit, number, trial))
+    return rows, tables
 
 
-def _match_columns(number: int, trial: Trial) -> dict[str, NDArray[Any]]:
+def _match_table(unit: int, number: int, trial: Trial) -> pl.DataFrame:
     matches, verdict = trial.matches, trial.classification
-    nothing = torch.full((matches.num_matches,), torch.nan, dtype=torch.float32)
-    return {
-        "trial": np.full(matches.num_matches, number, np.int32),
+    count = matches.num_matches
+
+    def or_null(values: Tensor | None) -> pl.Series:
+        return pl.Series([None] * count, dtype=pl.Float32) if values is None else pl.Series(values.float().numpy())
+
+    columns = {
+        "unit": np.full(count, unit, np.int32),
+        "trial": np.full(count, number, np.int32),
         "x0": matches.keypoints0[:, 0].numpy(),
         "y0": matches.keypoints0[:, 1].numpy(),
         "x1": matches.keypoints1[:, 0].numpy(),
         "y1": matches.keypoints1[:, 1].numpy(),
-        "cost": (nothing if matches.cost is None else matches.cost).numpy(),
+        "cost": or_null(matches.cost),
         "inlier": verdict.inlier.numpy(),
         "relation": verdict.relation.numpy(),
-        "score": (nothing if trial.score is None else trial.score).float().numpy(),
+        "score": or_null(trial.score),
         "correct": trial.correct.numpy(),
-        "valid": trial.valid.numpy(),
     }
+    known = pl.when(pl.Series(trial.valid.numpy())).then(pl.col("correct"))
+    table = pl.DataFrame(columns).with_columns(pl.col("cost", "score").fill_nan(None), known.alias("correct"))
+    return table.cast(MATCHES_SCHEMA)  # type: ignore[arg-type]

@@ -19,9 +19,10 @@ import pytest
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import read_image, read_manifest, write_pfm
+from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.sweeps import SweepProgress, build_plan, expand_grid, read_errors, read_results, run_sweep
+from tensor_stereo.sweeps.driver import MAX_DEATHS, drive
 from tensor_stereo.sweeps.engines import LocalEngine, Outcome
-from tensor_stereo.sweeps.run import MAX_DEATHS, drive
 from tensor_stereo.sweeps.store import FORMAT, RunStore
 from tensor_stereo.sweeps.units import run_tasks
 from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, write_pairs
@@ -152,10 +153,11 @@ class _DeadlyEngine:
 
 
 def test_only_the_unit_that_kills_its_worker_fails(inputs: Inputs, expected: pl.DataFrame, tmp_path: Path) -> None:
-    plan = build_plan(inputs.config, read_manifest(inputs.manifest))
+    pairs = PairTable(inputs.manifest)
+    plan = build_plan(inputs.config, pairs)
     out = tmp_path / "run"
-    units = list(range(plan.num_units))
-    with RunStore(out, {"format": FORMAT, "sweep": asdict(inputs.config)}, pl.DataFrame({"scene": [1]})) as store:
+    units = plan.shard(1, 1)
+    with RunStore(out, {"format": FORMAT, "sweep": asdict(inputs.config)}, pairs) as store:
         summary = drive(_DeadlyEngine(inputs.config, {3, 8}), plan, store, units, units)
     assert summary.progress.num_done == 12
     assert summary.progress.num_failed == 2
@@ -185,8 +187,8 @@ def test_a_worker_that_dies_at_work_is_noticed_and_replaced(inputs: Inputs) -> N
         engine.submit([plan.task(0)])
         assert engine.collect(PATIENCE_S) == []
         (outcome,) = engine.collect(PATIENCE_S)
-        assert outcome.results is not None
-        assert len(outcome.results[0].rows) == 240
+        assert outcome.result is not None
+        assert len(outcome.result.metrics) == 240
     finally:
         engine.close()
 

@@ -24,7 +24,8 @@ from tensor_stereo.sweeps import (
     read_results,
     run_sweep,
 )
-from tensor_stereo.sweeps.store import FORMAT, METRICS_SCHEMA, read_config_file
+from tensor_stereo.sweeps.batches import METRICS_SCHEMA
+from tensor_stereo.sweeps.store import FORMAT, read_config_file
 from tests.cli.failing import fails
 from tests.sweeps.conftest import Inputs, stored
 

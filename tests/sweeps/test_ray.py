@@ -45,7 +45,7 @@ def _ray_workers() -> list[int]:
                 title = (entry / "cmdline").read_bytes()
             except OSError:  # it has ended
                 continue
-            if title.startswith(b"ray::run_tasks"):
+            if title.startswith(b"ray::run_batch"):
                 found.append(int(entry.name))
     return found
 

@@ -25,6 +25,7 @@ from tensor_stereo.sweeps import (
     read_results,
     run_sweep,
 )
+from tensor_stereo.sweeps.units import check_trials
 from tests.sweeps.conftest import GRID, Inputs, assert_same, make_manifest, stored, write_pairs
 
 
@@ -128,6 +129,7 @@ def test_a_bad_setting_is_told_before_anything_runs(
     config = SweepConfig(expand_grid([{"detector": ["fast", "gftt"], "verdict": "cardinality"}]))
     trials = replace(config.trials[0], backend="scipy"), replace(config.trials[1], backend="native")
     monkeypatch.setattr(backends, "kernels", None)  # what this machine lacks is known when a point runs
+    monkeypatch.setattr("tensor_stereo.sweeps.run.check_points", check_trials)  # here, where it lacks them
     with pytest.raises(ValueError, match=r"point 1 of the grid \(gftt\): backend 'native'"):
         run_sweep(SweepConfig(trials), inputs.manifest, tmp_path / "run")
     monkeypatch.undo()
@@ -177,8 +179,9 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
     """The journal alone says what is done: no part is read, no worker starts."""
     from tensor_stereo.datasets import write_manifest
     from tensor_stereo.datasets.manifest import SCHEMA
-    from tensor_stereo.sweeps.store import METRICS_SCHEMA, RunStore
-    from tensor_stereo.sweeps.units import UnitResult
+    from tensor_stereo.datasets.pair_table import PairTable
+    from tensor_stereo.sweeps.batches import METRICS_SCHEMA, make_batch
+    from tensor_stereo.sweeps.store import RunStore
 
     count = 10_000
     table = pl.DataFrame(
@@ -199,9 +202,10 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
     out = tmp_path / "run"
     run_sweep(read_grid(tmp_path / "sweep.toml"), tmp_path / "m.parquet", out, limit=0)
     known = json.loads((out / "config.json").read_text())
-    with RunStore(out, known, table) as store:
-        for unit in range(count):
-            store.add(UnitResult(unit, [dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0, "num_valid": 1}]))
+    row = dict.fromkeys(METRICS_SCHEMA) | {"trial": 0, "num_valid": 1}
+    with RunStore(out, known, PairTable(tmp_path / "m.parquet", check_files=False)) as store:
+        for first in range(0, count, 100):
+            store.add(make_batch([row | {"unit": unit} for unit in range(first, first + 100)]))
     command = [sys.executable, "-m", "tensor_stereo", "sweep", str(tmp_path / "sweep.toml")]
     command += ["--manifest", str(tmp_path / "m.parquet"), "--out", str(out)]
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
@@ -11,28 +12,34 @@ import pytest
 
 from tensor_stereo import atomic
 from tensor_stereo.configs import SweepConfig, TrialConfig
+from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.sweeps import RunInUseError, read_errors, read_results
+from tensor_stereo.sweeps.batches import METRICS_SCHEMA, BatchResult, make_batch
 from tensor_stereo.sweeps.journal import read_journals
-from tensor_stereo.sweeps.store import FORMAT, METRICS_SCHEMA, RunStore
-from tensor_stereo.sweeps.units import UnitResult
+from tensor_stereo.sweeps.store import FORMAT, RunStore
 
-MANIFEST = pl.DataFrame({"scene": ["a", "b"]})
 SWEEP = asdict(SweepConfig((TrialConfig(verdict="cardinality", score="none"),)))
-CONFIG = {"format": FORMAT, "sweep": SWEEP, "manifest": {"num_pairs": 2}}
+CONFIG: dict[str, object] = {"format": FORMAT, "sweep": SWEEP, "manifest": {"num_pairs": 2}}
 
 
-def _good(unit: int) -> UnitResult:
-    row = dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0, "num_matches": 10 * unit}
-    return UnitResult(unit, [row])
+def _good(unit: int) -> BatchResult:
+    return make_batch([dict.fromkeys(METRICS_SCHEMA) | {"unit": unit, "trial": 0, "num_matches": 10 * unit}])
 
 
-def _bad(unit: int, message: str = "torn") -> UnitResult:
+def _bad(unit: int, message: str = "torn") -> BatchResult:
     names = ("dataset", "scene", "detector", "stage", "error")
-    return UnitResult(unit, [], dict.fromkeys(names, "x") | {"message": message})
+    return make_batch([], [{"unit": unit, "attempts": 1, "message": message} | dict.fromkeys(names, "x")])
 
 
-def _open(out: Path, **options: object) -> RunStore:
-    return RunStore(out, CONFIG, MANIFEST, **options)  # type: ignore[arg-type]
+def _open(out: Path, config: dict[str, object] = CONFIG, **options: object) -> RunStore:
+    with tempfile.TemporaryDirectory(prefix="manifest") as folder:
+        path = Path(folder, "pairs.csv")
+        path.write_text("image0,image1,scene\n/a.png,/b.png,a\n/a.png,/b.png,b\n")
+        return RunStore(out, config, PairTable(path, check_files=False), **options)  # type: ignore[arg-type]
+
+
+def _done(store: RunStore) -> set[int]:
+    return set(store.state.good) | store.state.errors.keys()
 
 
 def _units(out: Path) -> list[int]:
@@ -68,7 +75,7 @@ def test_a_damaged_part_is_set_aside_and_not_done(tmp_path: Path) -> None:
     part = out / "metrics" / "part-1-of-1-000001.parquet"
     part.write_bytes(part.read_bytes()[:-1])
     with _open(out) as store:
-        assert store.state.done == {2, 3}
+        assert _done(store) == {2, 3}
         for unit in (0, 1):
             store.add(_good(unit))
     assert _units(out) == [0, 1, 2, 3]
@@ -84,8 +91,8 @@ def test_a_changed_byte_is_found_by_verify(tmp_path: Path) -> None:
     data = bytearray(part.read_bytes())
     data[20] ^= 1
     part.write_bytes(data)
-    assert read_journals(out).done == {0}
-    assert read_journals(out, verify=True).done == set()
+    assert list(read_journals(out).good) == [0]
+    assert list(read_journals(out, verify=True).good) == []
 
 
 def test_a_torn_line_of_the_journal_is_done_again(tmp_path: Path) -> None:
@@ -96,7 +103,7 @@ def test_a_torn_line_of_the_journal_is_done_again(tmp_path: Path) -> None:
     journal = out / "journal-1-of-1.jsonl"
     journal.write_bytes(journal.read_bytes()[:-10])
     with _open(out) as store:
-        assert store.state.done == {0}
+        assert _done(store) == {0}
         store.add(_good(1))
     assert _units(out) == [0, 1]
     assert all(json.loads(line) for line in journal.read_text().splitlines())
@@ -109,7 +116,7 @@ def test_a_part_in_no_journal_counts_once_at_most(tmp_path: Path) -> None:
         store.add(_good(0))
     (out / "journal-1-of-1.jsonl").write_bytes(b"")
     with _open(out) as store:
-        assert store.state.done == set()
+        assert _done(store) == set()
         store.add(_good(0))
     assert _units(out) == [0]
     assert pl.read_parquet(str(out / "metrics" / "part-*.parquet")).height == 1
@@ -124,7 +131,7 @@ def test_a_later_success_replaces_an_error(tmp_path: Path) -> None:
     assert read_errors(out)["unit"].to_list() == [0, 1]
     assert pl.read_parquet(out / "errors.parquet").equals(read_errors(out))
     with _open(out) as store:
-        assert store.state.done == {0, 1, 2}
+        assert _done(store) == {0, 1, 2}
         store.add(_good(0))
     assert read_errors(out)["message"].to_list() == ["gone"]
     assert pl.read_parquet(out / "errors.parquet").equals(read_errors(out))
@@ -140,7 +147,7 @@ def test_a_success_counts_whichever_journal_tells_it(tmp_path: Path) -> None:
         assert store.state.errors.keys() == {1}
         store.add(_good(1))
     with _open(out) as store:
-        assert store.state.good == store.state.done == {1}
+        assert set(store.state.good) == _done(store) == {1}
     assert _units(out) == [1]
     assert read_errors(out).is_empty()
 
@@ -153,7 +160,7 @@ def test_damage_to_a_unit_that_failed_before_does_it_again(tmp_path: Path) -> No
     part = next((out / "metrics").iterdir())
     part.write_bytes(part.read_bytes()[:-1])
     with _open(out) as store:
-        assert store.state.done == set()
+        assert _done(store) == set()
 
 
 def test_a_part_never_takes_the_name_of_another(tmp_path: Path) -> None:
@@ -163,7 +170,7 @@ def test_a_part_never_takes_the_name_of_another(tmp_path: Path) -> None:
     next((out / "metrics").iterdir()).unlink()
     for unit in (2, 1):
         with _open(out) as store:
-            assert unit not in store.state.done
+            assert unit not in _done(store)
             store.add(_good(unit))
     assert _units(out) == [1, 2]
 
@@ -192,7 +199,7 @@ def test_many_rows_make_a_part_of_their_own(tmp_path: Path) -> None:
     wide = dict.fromkeys(METRICS_SCHEMA)
     with _open(tmp_path / "run") as store:
         for unit in range(3):
-            store.add(UnitResult(unit, [wide | {"unit": unit, "trial": k} for k in range(15_000)]))
+            store.add(make_batch([wide | {"unit": unit, "trial": k} for k in range(15_000)]))
     assert len(list((tmp_path / "run" / "metrics").iterdir())) == 2
 
 
@@ -201,7 +208,7 @@ def test_another_configuration_is_refused(tmp_path: Path) -> None:
     with _open(out) as store:
         store.add(_good(0))
     with pytest.raises(ValueError, match=r"manifest\.num_pairs is 2 there, 3 here"):
-        RunStore(out, CONFIG | {"manifest": {"num_pairs": 3}}, MANIFEST)
+        _open(out, CONFIG | {"manifest": {"num_pairs": 3}})
     assert _units(out) == [0]
 
 
@@ -227,7 +234,7 @@ def test_one_process_a_shard(tmp_path: Path) -> None:
     assert _units(out) == [0]
     assert pl.read_parquet(out / "errors.parquet")["unit"].to_list() == [1, 2]
     with _open(out) as store:
-        assert store.state.done == {0, 1, 2}
+        assert _done(store) == {0, 1, 2}
 
 
 @pytest.mark.parametrize("survives", [0, 1, 2])

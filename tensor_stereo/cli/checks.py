@@ -166,13 +166,17 @@ def _check_report(command: Report) -> None:
 def _check_sweep(command: Sweep) -> None:
     from tensor_stereo.sweeps.grid import read_grid
 
-    read_grid(command.settings)
+    if not command.dry_run:  # which tells of every point
+        read_grid(command.settings)
     parse_shard(command.shard)
     for name, least in (("workers", 1), ("limit", 0)):
         value = getattr(command, name)
         if value is not None:
             _check_least(name, value, least)
-    check_source("manifest", command.manifest, (".parquet",))
+    if not command.manifest.is_dir():
+        check_source("manifest", command.manifest, (".csv", ".parquet"))
+    if not command.seconds_per_part >= 0:
+        raise ValueError(f"seconds_per_part must not be negative, got {command.seconds_per_part}")
     if not command.dry_run:
         prepare_folder("out", command.out)
 

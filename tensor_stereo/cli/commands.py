@@ -201,7 +201,7 @@ class Sweep:
     settings: tyro.conf.Positional[Path]
     """TOML file with the grid."""
     manifest: Path
-    """Parquet file that index wrote."""
+    """Parquet file that index wrote, a folder of such files, or a CSV list of pairs."""
     out: Path
     """Run folder."""
     engine: Literal["local", "ray"] = "local"
@@ -216,6 +216,8 @@ class Sweep:
     """Units to do now, at most."""
     retry_errors: bool = False
     """Do failed units again."""
+    seconds_per_part: float = 10.0
+    """Time that a finished unit waits at most until it is stored."""
     verify: bool = False
     """Hash the finished parts instead of trusting their size."""
     dry_run: bool = False

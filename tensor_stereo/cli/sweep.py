@@ -12,14 +12,18 @@ from tensor_stereo.cli.progress import describe_time, show_progress
 from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.evaluation.rows import STAGES
 from tensor_stereo.sweeps import SweepProgress, build_plan, read_errors, read_grid, run_sweep
+from tensor_stereo.sweeps.grid import explain_grid
 from tensor_stereo.sweeps.plan import Plan
 from tensor_stereo.sweeps.results import has_ground_truth
 
 
 def run_sweep_command(command: Sweep) -> int:
     """Run a sweep; 0 if every unit is done, 1 if some failed, 130 if it was interrupted."""
-    config = read_grid(command.settings)
     shard = parse_shard(command.shard)
+    if command.dry_run:
+        for line in explain_grid(command.settings):
+            print(line)
+    config = read_grid(command.settings)
     if command.dry_run:
         print_plan(build_plan(config, PairTable(command.manifest, check_files=False)), shard)
         return OK
@@ -34,19 +38,21 @@ def run_sweep_command(command: Sweep) -> int:
             shard=shard,
             limit=command.limit,
             retry_errors=command.retry_errors,
+            seconds_per_part=command.seconds_per_part,
             verify=command.verify,
             log_level=command.log_level,
-            on_progress=lambda state: show(state.num_done, state.num_units, _describe(state)),
+            on_progress=lambda state: show(*_count(state, command.limit), _describe(state)),
         )
     end = summary.progress
     print(f"{end.num_done} of {end.num_units} units done, {end.num_new} now, {end.num_failed} failed: {command.out}")
     if end.num_failed:
         print(f"The reasons are in {command.out / 'errors.parquet'}; --retry-errors does them again.")
+        reasons = read_errors(command.out)["message"].to_list()
+        print(f"Most frequent: {most_frequent(reasons)}")
     if summary.interrupted:
         print("Interrupted; the same command goes on.")
         return INTERRUPTED
     if end.num_failed:
-        reasons = read_errors(command.out)["message"].to_list()
         return fail(f"{end.num_failed} of {end.num_units} units failed: {most_frequent(reasons)}")
     if end.num_done == end.num_units and not config.export_matches and not has_ground_truth(command.out):
         return fail("no pair has known ground truth, so there are no rates; matches come with export_matches = true")
@@ -79,6 +85,11 @@ def print_plan(plan: Plan, shard: tuple[int, int]) -> None:
         )
     files = plan.pairs[pair]
     print(f"Timed on {files.dataset}/{files.scene}: about {describe_time(total * num_pairs)} for all on one worker.")
+
+
+def _count(state: SweepProgress, limit: int | None) -> tuple[int, int]:
+    """How many of how many: of all units, or of those that this call does, where it is limited."""
+    return (state.num_done, state.num_units) if limit is None else (state.num_new, state.num_todo)
 
 
 def _describe(state: SweepProgress) -> str:

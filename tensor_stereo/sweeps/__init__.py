@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from tensor_stereo.sweeps.results import read_errors as read_errors
     from tensor_stereo.sweeps.results import read_results as read_results
     from tensor_stereo.sweeps.run import run_sweep as run_sweep
+    from tensor_stereo.sweeps.stored_matches import MatchDataset as MatchDataset
     from tensor_stereo.sweeps.stored_matches import StoredMatches as StoredMatches
     from tensor_stereo.sweeps.stored_matches import read_matches as read_matches
 
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "MatchDataset": "stored_matches",
         "Plan": "plan",
         "RunInUseError": "journal",
         "StoredMatches": "stored_matches",

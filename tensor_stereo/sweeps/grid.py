@@ -46,6 +46,53 @@ def read_grid(path: Path | str) -> SweepConfig:
     [('fast', 0.0), ('fast', 0.5), ('gftt', 0.0), ('gftt', 0.5)]
     """
     path = Path(path)
+    document = _read_document(path)
+    try:
+        export_matches = document.get("export_matches", False)
+        if not isinstance(export_matches, bool):
+            raise ValueError(f"export_matches must be true or false, got {export_matches!r}")
+        return SweepConfig(expand_grid(_tables(document)), export_matches)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def explain_grid(path: Path | str) -> list[str]:
+    r"""What becomes of the points of a file of settings that give no trial of their own, one line each.
+
+    Such points contradict themselves, or differ from another one only in settings that they do not use.
+
+    Args:
+        path: As :func:`read_grid` takes it.
+
+    Raises:
+        FileNotFoundError, ValueError: As :func:`read_grid`, but not for points that contradict themselves.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "sweep.toml")
+    ...     _ = path.write_text('[grid]\nverdict = ["cardinality", "score"]\nthreshold = ["none", 0.3]\n')
+    ...     len(explain_grid(path))
+    1
+    """
+    path = Path(path)
+    lines = []
+    known: dict[TrialConfig, str] = {}
+    try:
+        tables = _tables(_read_document(path))
+        for number, table in enumerate(tables):
+            where = f"grid {number + 1}: " if len(tables) > 1 else ""
+            for text, trial in _points(list(_axes(table, TrialConfig, ""))):
+                point = where + (text or "the only point")
+                if isinstance(trial, ValueError):
+                    lines.append(f"{point}: an error: {trial}")
+                elif (other := known.setdefault(simplify(trial), point)) != point:
+                    lines.append(f"{point}: the same as {other}; what tells them apart is not used")
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return lines
+
+
+def _read_document(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of settings {path}")
     if path.stat().st_size > _MAX_BYTES:
@@ -56,17 +103,15 @@ def read_grid(path: Path | str) -> SweepConfig:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML file: {error}") from error
-    try:
-        unknown = sorted(document.keys() - set(_TOP))
-        if unknown:
-            raise ValueError(f"{unknown[0]!r} is unknown above the tables; known are {', '.join(_TOP)}")
-        tables = document.get("grid", {})
-        export_matches = document.get("export_matches", False)
-        if not isinstance(export_matches, bool):
-            raise ValueError(f"export_matches must be true or false, got {export_matches!r}")
-        return SweepConfig(expand_grid(tables if isinstance(tables, list) else [tables]), export_matches)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    unknown = sorted(document.keys() - set(_TOP))
+    if unknown:
+        raise ValueError(f"{path}: {unknown[0]!r} is unknown above the tables; known are {', '.join(_TOP)}")
+    return document
+
+
+def _tables(document: Mapping[str, Any]) -> list[Any]:
+    tables = document.get("grid", {})
+    return tables if isinstance(tables, list) else [tables]
 
 
 def _check_dots(text: str) -> None:
@@ -114,6 +159,21 @@ def expand_grid(tables: Sequence[Mapping[str, Any]]) -> tuple[TrialConfig, ...]:
 def _expand(axes: Sequence[tuple[tuple[str, ...], list[Any]]]) -> list[TrialConfig]:
     """The points of one product; raises for those that contradict themselves, all at once."""
     trials, wrong = [], []
+    for point, trial in _points(axes):
+        if isinstance(trial, ValueError):
+            wrong.append(f"{point}: {trial}" if point else str(trial))
+        else:
+            trials.append(trial)
+    if wrong:
+        shown = "; ".join(wrong[:_MAX_LISTED]) + ("; ..." if len(wrong) > _MAX_LISTED else "")
+        num_points = len(trials) + len(wrong)
+        head = f"{len(wrong)} of {num_points} points contradict themselves, put them in tables [[grid]] of their own: "
+        raise ValueError((head if num_points > 1 else "") + shown)
+    return trials
+
+
+def _points(axes: Sequence[tuple[tuple[str, ...], list[Any]]]) -> Iterator[tuple[str, TrialConfig | ValueError]]:
+    """Every point of one product in words, by what varies, with its settings or with why they contradict each other."""
     num_points = math.prod(len(values) for _, values in axes)
     if num_points > _MAX_POINTS:
         raise ValueError(f"a grid must have at most {_MAX_POINTS} points, got {num_points}")
@@ -124,19 +184,14 @@ def _expand(axes: Sequence[tuple[tuple[str, ...], list[Any]]]) -> list[TrialConf
             for name in names[:-1]:
                 place = place.setdefault(name, {})
             place[names[-1]] = value
+        varying = [(names, v) for (names, some), v in zip(axes, values, strict=True) if len(some) > 1]
+        point = ", ".join(f"{'.'.join(names)} = {'none' if value is None else value}" for names, value in varying)
         try:
-            trials.append(_make(_DEFAULT, settings))
+            yield point, _make(_DEFAULT, settings)
         except LimitError:  # no matter of the other settings
             raise
         except ValueError as error:
-            varying = [(names, v) for (names, some), v in zip(axes, values, strict=True) if len(some) > 1]
-            point = ", ".join(f"{'.'.join(names)} = {'none' if value is None else value}" for names, value in varying)
-            wrong.append(f"{point}: {error}" if point else str(error))
-    if wrong:
-        shown = "; ".join(wrong[:_MAX_LISTED]) + ("; ..." if len(wrong) > _MAX_LISTED else "")
-        head = f"{len(wrong)} of {num_points} points contradict themselves, put them in tables [[grid]] of their own: "
-        raise ValueError((head if num_points > 1 else "") + shown)
-    return trials
+            yield point, error
 
 
 def simplify(trial: TrialConfig) -> TrialConfig:

@@ -71,9 +71,13 @@ def scan_parts(run: Path | str, folder: str, schema: dict[str, Any]) -> pl.LazyF
         folder: ``metrics`` or ``matches``.
         schema: its columns; those that a part lacks are null.
     """
+    return scan_parquet(finished_parts(run, folder), schema)  # parts of an earlier release may lack columns
+
+
+def finished_parts(run: Path | str, folder: str) -> list[Path]:
+    """The files of one kind that the journals list, ``metrics`` or ``matches``."""
     run = _check_run(run)
-    names = sorted(name for name in read_journals(run).files if name.startswith(f"{folder}/"))
-    return scan_parquet([run / name for name in names], schema)  # parts of an earlier release may lack columns
+    return [run / name for name in sorted(read_journals(run).files) if name.startswith(f"{folder}/")]
 
 
 def _check_run(run: Path | str) -> Path:

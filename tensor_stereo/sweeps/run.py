@@ -80,6 +80,8 @@ def run_sweep(
         raise ValueError(f"limit must not be negative, got {limit}")
     if num_workers is not None and num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
+    if not seconds_per_part >= 0:
+        raise ValueError(f"seconds_per_part must not be negative, got {seconds_per_part}")
     if engine not in ("local", "ray"):
         raise ValueError(f"engine must be 'local' or 'ray', got {engine!r}")
     config = replace(config, trials=tuple(simplify(trial) for trial in config.trials))

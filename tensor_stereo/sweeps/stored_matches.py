@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import polars as pl
 import torch
 from torch import Tensor
+from torch.utils.data import IterableDataset, get_worker_info
 
 from tensor_stereo.sweeps.batches import MATCHES_SCHEMA, METRICS_SCHEMA
-from tensor_stereo.sweeps.results import scan_parts
+from tensor_stereo.sweeps.results import finished_parts, scan_parts
+from tensor_stereo.table_files import scan_parquet
 from tensor_stereo.types import Matches
 
 
@@ -18,7 +24,9 @@ class StoredMatches:
     """The matches of one pair under one setting, as a training loop wants them.
 
     Attributes:
-        matches: the putative matches, without groups.
+        dataset: of the pair.
+        scene: of the pair.
+        matches: the M putative matches, without groups.
         inlier: (M,) bool, the verdict.
         relation: (M,) int8 values of :class:`tensor_stereo.Relation`.
         score: (M,) float32, or None.
@@ -26,12 +34,66 @@ class StoredMatches:
         valid: (M,) bool, ground truth is known.
     """
 
+    dataset: str
+    scene: str
     matches: Matches
     inlier: Tensor
     relation: Tensor
     score: Tensor | None
     correct: Tensor
     valid: Tensor
+
+
+class MatchDataset(IterableDataset[StoredMatches]):
+    """The matches of every pair of a sweep with ``export_matches``, for a ``DataLoader``.
+
+    Each part of the run is read once, by one worker of the loader; a part is held at a time. Without ``shuffle`` the
+    order is that of the parts. Pass ``batch_size=None``, or a ``collate_fn`` that does not stack, and
+    ``multiprocessing_context="spawn"`` with workers: the threads of Polars, which reads the parts, survive no fork.
+
+    Args:
+        run: run folder, finished or not.
+        trial: number of the point in ``config.json``.
+        shuffle: whether parts, and pairs within a part, come in a random order, another one in every epoch.
+        seed: of that order.
+        shard: (i, n): the i-th of n parts of the data, counted from 1, as for the processes of distributed training.
+
+    Raises:
+        FileNotFoundError: if ``run`` is no run folder.
+        ValueError: if it keeps no matches, has another format, or ``shard`` is not 1 <= i <= n.
+    """
+
+    def __init__(
+        self,
+        run: Path | str,
+        *,
+        trial: int = 0,
+        shuffle: bool = False,
+        seed: int = 0,
+        shard: tuple[int, int] = (1, 1),
+    ) -> None:
+        if not 1 <= shard[0] <= shard[1]:
+            raise ValueError(f"shard must be (i, n) with 1 <= i <= n, got {shard}")
+        self.run, self.trial, self.shuffle, self.seed, self.shard = Path(run), trial, shuffle, seed, shard
+        self.epoch = 0
+        self.parts = finished_parts(run, "matches")
+        _check_kept(self.run, self.parts)
+
+    def __iter__(self) -> Iterator[StoredMatches]:
+        rng = np.random.default_rng([self.seed, self.epoch])
+        self.epoch += 1
+        parts = [self.parts[k] for k in rng.permutation(len(self.parts))] if self.shuffle else self.parts
+        loader = get_worker_info()
+        worker, workers = (0, 1) if loader is None else (loader.id, loader.num_workers)
+        first, step = (self.shard[0] - 1) * workers + worker, self.shard[1] * workers
+        for part in parts[first::step]:
+            rows = _scan(self.run / "metrics" / part.name, METRICS_SCHEMA).filter(trial=self.trial)
+            names = rows.select("unit", "dataset", "scene", "score").collect().rows()
+            table = _scan(part, MATCHES_SCHEMA).filter(trial=self.trial).collect()
+            of_unit = table.partition_by("unit", as_dict=True, maintain_order=True)
+            order = rng.permutation(len(names)) if self.shuffle else range(len(names))
+            for unit, dataset, scene, score in (names[k] for k in order):
+                yield _to_tensors(dataset, scene, score, of_unit.get((unit,), table.head(0)))
 
 
 def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -> StoredMatches:
@@ -51,26 +113,41 @@ def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -
     units = rows.select("unit", "score").collect()
     if not len(units):
         raise ValueError(f"{run} has no finished unit of {dataset}/{scene} with trial {trial}")
+    _check_kept(Path(run), finished_parts(run, "matches"))
     stored = scan_parts(run, "matches", MATCHES_SCHEMA).filter(unit=units["unit"][0], trial=trial)
-    table = stored.collect()
-    if not any(Path(run, "matches").glob("part-*.parquet")):
+    return _to_tensors(dataset, scene, units["score"][0], stored.collect())
+
+
+def _check_kept(run: Path, parts: Sequence[Path]) -> None:
+    if not parts:
         raise ValueError(f"{run} keeps no matches; set export_matches = true above the grid")
-    columns = {name: torch.from_numpy(table[name].to_numpy(writable=True)) for name in ("x0", "y0", "x1", "y1")}
-    has_score = units["score"][0] != "none"
-    cost, score = (
-        torch.from_numpy(table[name].to_numpy(writable=True)) if there else None
-        for name, there in (("cost", not table["cost"].null_count()), ("score", has_score))
-    )
+
+
+def _scan(part: Path, schema: dict[str, Any]) -> pl.LazyFrame:
+    return scan_parquet([part], schema)
+
+
+def _to_tensors(dataset: str, scene: str, score_name: str, table: pl.DataFrame) -> StoredMatches:
+    """The rows of one pair under one setting."""
+
+    def tensor(name: str) -> Tensor:
+        return torch.from_numpy(table[name].to_numpy(writable=True))
+
+    def mask(values: pl.Series) -> Tensor:
+        return torch.tensor(values.to_list(), dtype=torch.bool)
+
     return StoredMatches(
+        dataset,
+        scene,
         matches=Matches(
-            torch.stack([columns["x0"], columns["y0"]], 1),
-            torch.stack([columns["x1"], columns["y1"]], 1),
+            torch.stack([tensor("x0"), tensor("y0")], 1),
+            torch.stack([tensor("x1"), tensor("y1")], 1),
             torch.tensor([0, len(table)]),
-            cost,
+            None if table["cost"].null_count() else tensor("cost"),
         ),
-        inlier=torch.tensor(table["inlier"].to_list(), dtype=torch.bool),
+        inlier=mask(table["inlier"]),
         relation=torch.tensor(table["relation"].to_list(), dtype=torch.int8),
-        score=score,
-        correct=torch.tensor(table["correct"].fill_null(value=False).to_list(), dtype=torch.bool),
-        valid=torch.tensor(table["correct"].is_not_null().to_list(), dtype=torch.bool),
+        score=tensor("score") if score_name != "none" else None,
+        correct=mask(table["correct"].fill_null(value=False)),
+        valid=mask(table["correct"].is_not_null()),
     )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tensor_stereo.configs import RESTRICTIONS, SCORES, VERDICTS, ConsensusConfig, TrialConfig
 from tensor_stereo.sweeps import expand_grid, read_grid
-from tensor_stereo.sweeps.grid import simplify
+from tensor_stereo.sweeps.grid import explain_grid, simplify
 
 
 def _read(tmp_path: Path, text: str):
@@ -239,6 +239,28 @@ def test_what_contradicts_itself_is_named_with_its_reason(tmp_path: Path, text: 
     for word in words:
         assert word in str(error.value)
     assert ("points" in str(error.value)) == ("[" in text)
+
+
+def test_points_that_are_errors_or_equal_are_explained_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.toml"
+    path.write_text(
+        'grid = [{verdict = ["cardinality", "score"], threshold = ["none", 0.3], seed = [0, 1]}, {seed = 2}]'
+    )
+    lines = explain_grid(path)
+    errors = [line for line in lines if "an error" in line]
+    assert len(errors) == 2
+    assert errors[0].startswith("grid 1: verdict = cardinality, threshold = 0.3, seed = 0: an error: ")
+    assert "threshold" in errors[0].split("an error: ")[1]
+    assert [line for line in lines if line not in errors] == [
+        f"grid 1: verdict = {verdict}, threshold = {threshold}, seed = 1: the same as grid 1: verdict = {verdict}, "
+        f"threshold = {threshold}, seed = 0; what tells them apart is not used"
+        for verdict, threshold in (("cardinality", "none"), ("score", "none"), ("score", 0.3))
+    ] + [
+        "grid 2: the only point: the same as grid 1: verdict = score, threshold = none, seed = 0; what tells them "
+        "apart is not used"
+    ]
+    path.write_text('[grid]\ndetector = ["fast", "sift"]\n')
+    assert explain_grid(path) == []
 
 
 def test_of_many_contradictions_the_first_are_listed_and_all_are_counted() -> None:

@@ -21,7 +21,7 @@ dev: $(READY)  ## Build the environment in .venv (a torch that is there already 
 
 $(READY): pyproject.toml $(CONSTRAINTS) $(wildcard kernels/*.* kernels/*/*.* kernels/*/*/*.*)
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --editable '.[dev,notebooks,download,hloc,colmap,ray]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) --editable '.[dev,notebooks,download,hloc,colmap,ray,s3]'
 	touch $@
 
 demo: $(READY)  ## Classify the embedded synthetic set with all detectors; tables and figures go to out/demo

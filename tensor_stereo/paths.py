@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 TABLES = (".csv", ".parquet")  # endings of tables that are written
+_STORE = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(?=[/\\\\])")  # what a path leaves of a URL
 MAPS = (".pfm", ".png", ".npy", ".tif", ".tiff")  # endings of maps that are read and written
 
 
@@ -130,12 +132,30 @@ def prepare_targets(targets: dict[str, tuple[Path | None, Sequence[str]]], sourc
             taken[name] = path
 
 
+def check_no_store(name: str, path: Path) -> None:
+    """Raise if a path to write to is what is left of a URL of an object store.
+
+    Raises:
+        ValueError: because nothing can be renamed there in one step.
+
+    >>> check_no_store("out", Path("results"))
+    """
+    store = _STORE.match(str(path))
+    if store is not None and not Path(store[0]).exists():
+        raise ValueError(
+            f"{name} must lie on a local or shared disk, got {path}: results are renamed in one step, which a store of "
+            f"{store[1]} cannot do; copy them there when they are finished"
+        )
+
+
 def prepare_folder(name: str, path: Path) -> Path:
     """Make a folder that shall be written to, and raise unless it can be.
 
     Raises:
+        ValueError: if the path is a URL.
         OSError: if the folder cannot be made or written to.
     """
+    check_no_store(name, path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

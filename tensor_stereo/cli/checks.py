@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from tensor_stereo.cli.commands import (
@@ -19,6 +20,7 @@ from tensor_stereo.cli.commands import (
     Sweep,
 )
 from tensor_stereo.datasets.files import check_gt_scale, check_sample_bits
+from tensor_stereo.datasets.remote import to_location
 from tensor_stereo.interop.formats import check_files
 from tensor_stereo.interop.match_lists import find_match_files, is_many
 from tensor_stereo.interop.result_names import check_score_name
@@ -173,8 +175,9 @@ def _check_sweep(command: Sweep) -> None:
         value = getattr(command, name)
         if value is not None:
             _check_least(name, value, least)
-    if not command.manifest.is_dir():
-        check_source("manifest", command.manifest, (".csv", ".parquet"))
+    manifest = to_location(command.manifest)
+    if isinstance(manifest, Path) and not manifest.is_dir():
+        check_source("manifest", manifest, (".csv", ".parquet"))
     if not command.seconds_per_part >= 0:
         raise ValueError(f"seconds_per_part must not be negative, got {command.seconds_per_part}")
     if not command.dry_run:

@@ -200,8 +200,8 @@ class Sweep:
 
     settings: tyro.conf.Positional[Path]
     """TOML file with the grid."""
-    manifest: Path
-    """Parquet file that index wrote, a folder of such files, or a CSV list of pairs."""
+    manifest: str
+    """Parquet file that index wrote, a folder of such files, or a CSV list of pairs; also by a URL of fsspec."""
     out: Path
     """Run folder."""
     engine: Literal["local", "ray"] = "local"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tensor_stereo.datasets.eth3d import eth3d_pairs
 from tensor_stereo.datasets.files import (
+    Location,
     PairFiles,
     StrPath,
     check_gt_scale,
@@ -124,8 +125,8 @@ def find_scale(image0: Path, disparity_gt: Path) -> float | None:
     return None
 
 
-def _is_same(path: Path | None, other: Path) -> bool:
-    return path is not None and path.is_file() and other.is_file() and path.samefile(other)
+def _is_same(path: Location | None, other: Path) -> bool:
+    return isinstance(path, Path) and path.is_file() and other.is_file() and path.samefile(other)
 
 
 def _tell_apart(pairs: Sequence[PairFiles], root: Path) -> list[PairFiles]:
@@ -134,7 +135,7 @@ def _tell_apart(pairs: Sequence[PairFiles], root: Path) -> list[PairFiles]:
     told = []
     for pair in pairs:
         if counts[pair.dataset, pair.scene] > 1:
-            folder = pair.image0.parent.parent.relative_to(root).as_posix()
+            folder = Path(pair.image0).parent.parent.relative_to(root).as_posix()
             pair = replace(pair, dataset=f"{pair.dataset}:{folder}")
         told.append(pair)
     return sorted(told, key=lambda pair: (pair.dataset, pair.scene.casefold()))
@@ -155,5 +156,5 @@ def _select(pairs: Sequence[PairFiles], scenes: Iterable[str]) -> list[PairFiles
 
 
 def _has_release_scale(pair: PairFiles) -> bool:
-    is_map = pair.disparity_gt is not None and not has_ending(pair.disparity_gt, ".pfm")
+    is_map = pair.disparity_gt is not None and not has_ending(Path(pair.disparity_gt), ".pfm")
     return is_map and pair.gt_encoding == "scaled" and not pair.dataset.startswith("kitti")

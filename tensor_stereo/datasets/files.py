@@ -13,6 +13,7 @@ from tensor_stereo.limits import LimitError, Within
 from tensor_stereo.paths import has_ending
 
 StrPath: TypeAlias = str | os.PathLike[str]
+Location: TypeAlias = Path | str  # a path, or a URL of fsspec as text
 GT_ENCODINGS = ("scaled", "sintel", "flyingthings3d-subset")
 # Of views. The first that is there is taken; ground truth is never JPEG or WebP, which lose values.
 IMAGE_ENDINGS = (".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp", ".webp", ".jpg", ".jpeg")
@@ -27,7 +28,7 @@ _SKIPPED = re.compile(r"\..*|__MACOSX|Illum\d+", re.IGNORECASE)  # Illum: the sa
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The files of one rectified pair; nothing is opened yet.
+    """The files of one rectified pair, paths or URLs of fsspec; nothing is opened yet.
 
     Attributes:
         dataset: release, e.g. ``middlebury-2005``, ``middeval3``, ``kitti-2015``, ``eth3d``.
@@ -50,17 +51,17 @@ class PairFiles:
 
     dataset: str
     scene: str
-    image0: Path
-    image1: Path
-    disparity_gt: Path | None = None
+    image0: Location
+    image1: Location
+    disparity_gt: Location | None = None
     gt_scale: float | None = None
-    mask: Path | None = None
-    disparity_noc_gt: Path | None = None
-    calibration: Path | None = None
+    mask: Location | None = None
+    disparity_noc_gt: Location | None = None
+    calibration: Location | None = None
     gt_encoding: str = "scaled"
     sample_bits: int | None = None
-    disparity_est: Path | None = None
-    disparity1_est: Path | None = None
+    disparity_est: Location | None = None
+    disparity1_est: Location | None = None
     est_scale: float | None = None
 
 

@@ -12,10 +12,11 @@ import polars as pl
 
 from tensor_stereo.atomic import whole_file
 from tensor_stereo.datasets.discovery import find_pairs
-from tensor_stereo.datasets.files import PATHS, PairFiles, StrPath, check_sample_bits
+from tensor_stereo.datasets.files import PATHS, Location, PairFiles, StrPath, check_sample_bits
 from tensor_stereo.datasets.image_size import image_size
 from tensor_stereo.datasets.pair_lists import read_list
 from tensor_stereo.datasets.pair_table import SCHEMA, PairTable, pair_row, two_of_one_name
+from tensor_stereo.datasets.remote import absolute, fetched
 from tensor_stereo.paths import check_ending, has_ending
 from tensor_stereo.table_files import check_name, write_table
 
@@ -58,22 +59,22 @@ def build_manifest(
     if not roots:
         raise ValueError("roots must name at least one folder or CSV file")
     check_sample_bits(sample_bits)
-    found: dict[tuple[Path, Path], PairFiles] = {}
+    found: dict[tuple[Location, Location], PairFiles] = {}
     for root in map(Path, roots):
         is_list = has_ending(root, ".csv") and not root.is_dir()
         for pair in read_list(root) if is_list else find_pairs(root, gt_scale=gt_scale):
             if pair.sample_bits is None and sample_bits is not None:
                 pair = replace(pair, sample_bits=int(sample_bits))
-            found.setdefault((pair.image0.resolve(), pair.image1.resolve()), pair)
+            found.setdefault((absolute(pair.image0), absolute(pair.image1)), pair)
     pairs = sorted(found.values(), key=lambda pair: (pair.dataset, pair.scene.casefold()))
     _check_names(pairs)
     rows = []
     for pair in pairs:
-        check_name(pair.image0.resolve())
-        width, height = image_size(pair.image0)
-        paths = {name: getattr(pair, name) for name in PATHS}
-        absolute: dict[str, Any] = {name: None if path is None else path.resolve() for name, path in paths.items()}
-        rows.append(pair_row(replace(pair, **absolute)) | {"width_px": width, "height_px": height})
+        check_name(Path(absolute(pair.image0)))
+        with fetched(PairFiles("", "", pair.image0, pair.image0)) as local:
+            width, height = image_size(Path(local.image0))
+        paths: dict[str, Any] = {name: absolute(path) for name in PATHS if (path := getattr(pair, name)) is not None}
+        rows.append(pair_row(replace(pair, **paths)) | {"width_px": width, "height_px": height})
     return pl.DataFrame(rows, schema=SCHEMA)
 
 

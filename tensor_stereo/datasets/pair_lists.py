@@ -6,7 +6,16 @@ from pathlib import Path
 
 import polars as pl
 
-from tensor_stereo.datasets.files import GT_ENCODINGS, PATHS, SCALES, PairFiles, check_sample_bits, check_scale
+from tensor_stereo.datasets.files import (
+    GT_ENCODINGS,
+    PATHS,
+    SCALES,
+    Location,
+    PairFiles,
+    check_sample_bits,
+    check_scale,
+)
+from tensor_stereo.datasets.remote import beside
 from tensor_stereo.paths import has_ending
 from tensor_stereo.table_files import read_csv
 
@@ -14,12 +23,13 @@ _LISTED = ("image0", "image1")  # what a list must have
 COLUMNS = ("dataset", "scene", *PATHS, *SCALES, "gt_encoding", "sample_bits", "width_px", "height_px")
 
 
-def read_list(path: Path, check_files: bool = True) -> list[PairFiles]:
+def read_list(path: Path, check_files: bool = True, listed: Location | None = None) -> list[PairFiles]:
     """The pairs of a CSV of paths.
 
     Args:
         path: The list; its paths are absolute or relative to its folder.
-        check_files: Whether a listed file that is missing is an error.
+        check_files: Whether a listed file that is missing is an error; nobody looks at URLs.
+        listed: Where the list comes from, if not from ``path``.
 
     Raises:
         FileNotFoundError: if the list, or a listed file, is missing.
@@ -39,9 +49,9 @@ def read_list(path: Path, check_files: bool = True) -> list[PairFiles]:
         for name in _LISTED:
             if not values[name]:
                 raise ValueError(f"{path}, line {row + 2}: column {name!r} is empty")
-        paths = {name: path.parent / values[name] for name in PATHS if values.get(name)}
+        paths = {name: beside(listed or path, values[name]) for name in PATHS if values.get(name)}
         for name, file in paths.items():
-            if check_files and not file.is_file():
+            if check_files and isinstance(file, Path) and not file.is_file():
                 raise FileNotFoundError(f"{path}, line {row + 2}: column {name!r} names {file}, which is no file")
         scale, est_scale = (_scale(path, row, name, values.get(name)) for name in SCALES)
         try:
@@ -55,9 +65,9 @@ def read_list(path: Path, check_files: bool = True) -> list[PairFiles]:
                 f"{path}, line {row + 2}: column 'gt_encoding' must be one of {GT_ENCODINGS}, got {encoding!r}"
             )
         disparity = paths.get("disparity_gt")
-        if disparity is not None and scale is None and encoding == "scaled" and not has_ending(disparity, ".pfm"):
+        if disparity is not None and scale is None and encoding == "scaled" and not has_ending(Path(disparity), ".pfm"):
             raise ValueError(f"{path}, line {row + 2}: column 'gt_scale' is empty, but {disparity} is no PFM file")
-        dataset, scene = values.get("dataset") or path.stem, values.get("scene") or paths["image0"].stem
+        dataset, scene = values.get("dataset") or path.stem, values.get("scene") or Path(paths["image0"]).stem
         scales = {"gt_scale": scale, "est_scale": est_scale}
         pairs.append(PairFiles(dataset, scene, gt_encoding=encoding, sample_bits=bits, **scales, **paths))  # type: ignore[arg-type]
     return pairs

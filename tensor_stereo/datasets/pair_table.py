@@ -5,15 +5,28 @@ from __future__ import annotations
 import bisect
 import filecmp
 import math
+import os
 import shutil
+import tempfile
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import polars as pl
 
-from tensor_stereo.datasets.files import ESTIMATES, GT_ENCODINGS, PATHS, SAMPLE_BITS, SCALES, PairFiles, StrPath
+from tensor_stereo.datasets.files import (
+    ESTIMATES,
+    GT_ENCODINGS,
+    PATHS,
+    SAMPLE_BITS,
+    SCALES,
+    Location,
+    PairFiles,
+    StrPath,
+)
 from tensor_stereo.datasets.pair_lists import read_list
+from tensor_stereo.datasets.remote import fetch, is_url, to_location
 from tensor_stereo.paths import has_ending
 from tensor_stereo.table_files import lazy_parquet
 
@@ -49,7 +62,8 @@ class PairTable:
 
     Args:
         path: A Parquet file as :func:`tensor_stereo.datasets.write_manifest` writes it, a folder of such files, or a
-            CSV list of paths as :func:`tensor_stereo.datasets.build_manifest` takes it. Further columns are ignored.
+            CSV list of paths as :func:`tensor_stereo.datasets.build_manifest` takes it; also by a URL of fsspec.
+            Further columns are ignored.
 
     Raises:
         FileNotFoundError: if there is no such file, or none in the folder.
@@ -64,17 +78,24 @@ class PairTable:
     """
 
     def __init__(self, path: StrPath, *, check_files: bool = True) -> None:
-        self.path = Path(path)
+        self.path: Location = os.fspath(path) if is_url(os.fspath(path)) else Path(path)
+        found = self.path if isinstance(self.path, Path) else self._fetch(self.path)
         self._parts: list[_Part] = []
         self._num_rows = 0
         self._window = 0, pl.DataFrame(schema=SCHEMA)
-        for file, rows in _files(self.path, check_files):
+        for file, rows in _files(self.path, found, check_files):
             self._parts.append(_Part(file, rows, self._num_rows))
             self._num_rows += _check_rows(file, rows)
         self._starts = [part.first for part in self._parts]
         self._check_names()
         if check_files:
             self._check_files()
+
+    def _fetch(self, url: str) -> Path:
+        """A local copy, which ends with this table."""
+        folder = Path(tempfile.mkdtemp(prefix="tensor-stereo-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        return fetch(url, folder, tables=True)
 
     def __len__(self) -> int:
         return self._num_rows
@@ -161,7 +182,8 @@ class PairTable:
             rows = part.rows.select(PATHS).collect()
             for name in PATHS:
                 for file in rows[name].drop_nulls().unique(maintain_order=True):
-                    if not Path(file).is_file():
+                    location = to_location(file)
+                    if isinstance(location, Path) and not location.is_file():
                         row = int((rows[name] == file).arg_true()[0])
                         raise _wrong(part.path, row, name, f"names {file}, which is no file")
 
@@ -173,12 +195,12 @@ def two_of_one_name(dataset: str, scene: str, image0: object, other: object) -> 
 
 def to_pair(values: dict[str, Any]) -> PairFiles:
     """One row, checked before."""
-    paths: dict[str, Any] = {name: None if values[name] is None else Path(values[name]) for name in PATHS}
+    paths: dict[str, Any] = {name: None if values[name] is None else to_location(values[name]) for name in PATHS}
     others = ("dataset", "scene", "gt_encoding", "sample_bits", *SCALES)
     return PairFiles(**{name: values[name] for name in others}, **paths)
 
 
-def _files(path: Path, check_files: bool) -> Iterator[tuple[Path, pl.LazyFrame]]:
+def _files(given: Location, path: Path, check_files: bool) -> Iterator[tuple[Path, pl.LazyFrame]]:
     """The files of a manifest and their rows."""
     if path.is_dir():
         files = sorted(file for file in path.glob("*.parquet") if not file.name.startswith("."))
@@ -187,10 +209,10 @@ def _files(path: Path, check_files: bool) -> Iterator[tuple[Path, pl.LazyFrame]]
     elif path.is_file():
         files = [path]
     else:
-        raise FileNotFoundError(f"there is no manifest {path}")
+        raise FileNotFoundError(f"there is no manifest {given}")
     for file in files:
         if has_ending(file, ".csv"):
-            rows = [pair_row(pair) | {"width_px": 1, "height_px": 1} for pair in read_list(file, check_files)]
+            rows = [pair_row(pair) | {"width_px": 1, "height_px": 1} for pair in read_list(file, check_files, given)]
             yield file, pl.DataFrame(rows, schema=SCHEMA).lazy()
         else:
             yield file, _complete(file, lazy_parquet(file))

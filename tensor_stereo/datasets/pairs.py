@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from tensor_stereo.datasets.files import PairFiles, check_gt_scale, missing_scale
+from tensor_stereo.datasets.files import Location, PairFiles, check_gt_scale, missing_scale
 from tensor_stereo.datasets.images import (
     read_disparity_png,
     read_image,
@@ -23,6 +23,7 @@ from tensor_stereo.datasets.images import (
     read_sintel_occlusion,
 )
 from tensor_stereo.datasets.pfm import FloatMap, read_pfm
+from tensor_stereo.datasets.remote import fetched
 from tensor_stereo.paths import has_ending
 from tensor_stereo.types import StereoPair
 
@@ -33,7 +34,8 @@ def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
     Of a grey view beside a view in colour, the one channel is repeated.
 
     Args:
-        files: as found by :func:`~tensor_stereo.datasets.discovery.find_pairs`.
+        files: as found by :func:`~tensor_stereo.datasets.discovery.find_pairs`; those that are URLs of fsspec are
+            copied to this machine for the time of reading.
         gt_scale: replaces ``files.gt_scale``: stored value / gt_scale = disparity in px.
 
     Returns:
@@ -56,6 +58,12 @@ def read_pair(files: PairFiles, *, gt_scale: float | None = None) -> StereoPair:
     tensor([[nan, 2.]])
     """
     check_gt_scale(gt_scale)
+    with fetched(files) as local:
+        return _read_local(local, gt_scale)
+
+
+def _read_local(files: PairFiles, gt_scale: float | None) -> StereoPair:
+    """Read a pair whose files are paths."""
     image0, image1 = (read_image(path, sample_bits=files.sample_bits) for path in (files.image0, files.image1))
     channels = max(len(image0), len(image1))
     image0, image1 = (image.expand(channels, -1, -1).contiguous() for image in (image0, image1))
@@ -107,12 +115,12 @@ class PairDataset(Dataset[StereoPair]):
         return replace(read_pair(self.files[k], gt_scale=self.gt_scale), name=self.names[k])
 
 
-def _read_disparity(files: PairFiles, path: Path, gt_scale: float | None) -> FloatMap:
+def _read_disparity(files: PairFiles, path: Location, gt_scale: float | None) -> FloatMap:
     """(H, W) float32 in px, NaN where unknown."""
     scale = files.gt_scale if gt_scale is None else gt_scale
     if files.gt_encoding == "sintel":
         return read_sintel_disparity(path)
-    if not has_ending(path, ".pfm"):
+    if not has_ending(Path(path), ".pfm"):
         if scale is None:
             raise missing_scale(files)
         return read_disparity_png(path, scale)

@@ -16,6 +16,7 @@ from tensor_stereo.datasets.files import PairFiles
 from tensor_stereo.datasets.manifest import read_manifest
 from tensor_stereo.datasets.map_files import read_map, write_confidence
 from tensor_stereo.datasets.pairs import read_pair
+from tensor_stereo.datasets.remote import fetched, local_paths
 from tensor_stereo.dense.confidence import DisparityConfidence, check_verdict
 from tensor_stereo.paths import MAPS, TABLES, check_ending, check_source, prepare_folder
 from tensor_stereo.reports.confidence import RATES, ConfidenceSummary, summarize_confidence
@@ -99,12 +100,13 @@ def score_disparity_manifest(
     settings = tolerance | verdict | {"stride": stride, "unknown": unknown, "ending": ending}
 
     def run(number: int) -> ConfidenceSummary:
-        files, result = pairs[number], sources[number].results[0]
-        pair = read_pair(files)
-        given, other = (
-            None if path is None else _read(name, path, files.est_scale, unknown)
-            for name, path in (("disparity_est", files.disparity_est), ("disparity1_est", files.disparity1_est))
-        )
+        result = sources[number].results[0]
+        with fetched(pairs[number]) as files:
+            pair = read_pair(files)
+            given, other = (
+                None if path is None else _read(name, Path(path), files.est_scale, unknown)
+                for name, path in (("disparity_est", files.disparity_est), ("disparity1_est", files.disparity1_est))
+            )
         found = confidence(given, pair.image0[None], pair.image1[None], other)
         kept = found.keep(**verdict)[0, 0]
         result.parent.mkdir(parents=True, exist_ok=True)
@@ -148,16 +150,17 @@ def find_maps(manifest: Path, out: Path, ending: str) -> tuple[list[PairFiles], 
         name = f"{pair.dataset}/{pair.scene}"
         if pair.disparity_est is None:
             raise ValueError(f"manifest: {manifest} must name a disparity_est for every pair, {name} has none")
-        inputs = (pair.image0, pair.image1, pair.disparity_est, pair.disparity1_est, pair.disparity_gt)
+        maps = (pair.disparity_est, pair.disparity1_est, pair.disparity_gt)
+        inputs = local_paths(pair.image0, pair.image1, *maps)  # what has changed elsewhere nobody asks
         result = out / f"{name}{ending}"
         place = Path(os.path.normpath(result.absolute()))
         if not place.is_relative_to(os.path.normpath(out.absolute())):
             raise ValueError(f"manifest: {manifest} must have names of pairs that stay below out, got {name!r}")
         if taken.setdefault(place, name) != name:
             raise ValueError(f"manifest: {manifest} names {taken[place]} and {name}, whose results would have one name")
-        if place in {path.absolute() for path in inputs if path is not None}:
+        if place in {path.absolute() for path in inputs}:
             raise ValueError(f"out must be another folder than that of the maps, {place} would be replaced")
-        sources.append(Source(name, tuple(path for path in inputs if path is not None), (result,)))
+        sources.append(Source(name, inputs, (result,)))
     return pairs, sources
 
 

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets.pair_table import PairTable
+from tensor_stereo.paths import check_no_store
 from tensor_stereo.sweeps.driver import SweepProgress, SweepSummary, drive
 from tensor_stereo.sweeps.engines import Engine, LocalEngine, check_points
 from tensor_stereo.sweeps.grid import simplify
@@ -76,6 +77,7 @@ def run_sweep(
         OSError: if the run folder cannot be written; what its journal lists is safe.
     """
     out = Path(out)
+    check_no_store("out", out)
     if limit is not None and limit < 0:
         raise ValueError(f"limit must not be negative, got {limit}")
     if num_workers is not None and num_workers < 1:

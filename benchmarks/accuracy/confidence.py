@@ -25,6 +25,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from tensor_stereo.configs import SyntheticConfig
+from tensor_stereo.datasets.synthetic.rendering import render_scene
 from tensor_stereo.dense.confidence import load_confidence
 from tensor_stereo.dense.confidence_network import TOLERANCES_PX, ConfidenceNetwork
 from tensor_stereo.dense.map_evidence import measure_map, search_range
@@ -35,13 +37,13 @@ from tensor_stereo.features import to_gray
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from accuracy import confidence_measures as classic
 from accuracy import pandora_ambiguity
-from accuracy.confidence_figures import draw_curves
+from accuracy.confidence_figures import draw_curves, draw_maps
 from shared.calibration_error import calibration_error
 from shared.harness import Suite
 from shared.scenes import EIGHT, read_pairs
 from shared.sparsification import auc, keep_expected
 from training.ccnn import CCNN, score_ccnn
-from training.dense_maps import ALTERED, FAMILIES, METHODS, both_maps, family, make_methods
+from training.dense_maps import FAMILIES, METHODS, Floats, both_maps, family, make_methods
 from training.matching_network import load_matching
 from training.scenes import Views, list_scenes, read_views
 
@@ -90,7 +92,7 @@ def list_cases(sources: Sources) -> Iterator[Case]:
         for name in FAMILIES if scene.fold == _LEFT_OUT_FOLD else ():
             path = sources.folder / f"without-{name}.safetensors"
             if path.exists():
-                for method in (m for m in (*METHODS, ALTERED) if family(m) == name):
+                for method in (m for m in METHODS if family(m) == name):
                     yield make(group=f"{group} without {name}", method=method, network=path)
 
 
@@ -122,24 +124,21 @@ def load_ccnn(path: Path) -> CCNN | None:
 
 
 @torch.no_grad()
-def score(sources: Sources, case: Case) -> tuple[dict[str, Tensor], Tensor, dict[str, float]]:
-    """Every measure of one map, its errors where map and truth are known, and the seconds of each measure."""
-    views = read_case(sources, case)
-    truth = np.where(np.isfinite(views.disparity0), views.disparity0, np.nan)
-    count = int(np.clip(np.ceil(1.25 * np.nanquantile(truth, 0.999) / 16) * 16, 32, 256))
-    run = make_methods(load_matching(sources.folder, case.number or 0))[case.method]
-    disparity, disparity1 = both_maps(run, views.image0, views.image1, count)
+def score_maps(
+    views: Views, both: tuple[Floats, Floats], network: ConfidenceNetwork, ccnn: CCNN | None, max_error_px: float
+) -> tuple[dict[str, Floats], dict[str, float]]:
+    """(H, W) of every measure of a map, and the seconds that it took."""
+    disparity, disparity1 = both
     searched = search_range(disparity)
     curves = cost_curves(views.image0, views.image1, *searched)
-    network, ccnn = load_network(case.network), load_ccnn(case.ccnn)
-    slope, bias = network.calibration[TOLERANCES_PX.index(case.max_error_px)]
+    k = TOLERANCES_PX.index(max_error_px)
+    slope, bias = network.calibration[k]
 
-    def ours(other: bool) -> np.ndarray:
-        planes = torch.from_numpy(measure_map(disparity, views.image0, views.image1, disparity1 if other else None))
-        logit = network(planes[None])[0, TOLERANCES_PX.index(case.max_error_px)]
-        return torch.sigmoid(logit * slope + bias).numpy()
+    def ours(other: Floats | None) -> Floats:
+        planes = torch.from_numpy(measure_map(disparity, views.image0, views.image1, other))
+        return torch.sigmoid(network(planes[None])[0, k] * slope + bias).numpy()
 
-    measures: dict[str, Callable[[], np.ndarray]] = {
+    measures: dict[str, Callable[[], Floats]] = {
         "left-right": partial(classic.left_right, disparity, disparity1),
         "variance 21": partial(classic.variance, disparity, 21),
         "agreement 11": partial(classic.agreement, disparity, 11),
@@ -150,21 +149,33 @@ def score(sources: Sources, case: Case) -> tuple[dict[str, Tensor], Tensor, dict
         "agreement 21, left-right": lambda: (
             classic.agreement(disparity, 21) - np.tanh(-classic.left_right(disparity, disparity1) / 2)
         ),
-        "ours": partial(ours, True),
-        "ours without view 1": partial(ours, False),
+        "ours": partial(ours, disparity1),
+        "ours without view 1": partial(ours, None),
     }
     if ccnn is not None:
         measures["CCNN"] = partial(score_ccnn, ccnn, disparity)
     if pandora_ambiguity.is_there():
         measures["ambiguity (pandora)"] = partial(pandora_ambiguity.ambiguity, views.image0, views.image1, *searched)
-    error = np.abs(disparity - truth)
-    known = np.isfinite(error)
     found, seconds = {}, {}
     for name, call in measures.items():
         start = time.perf_counter()
-        values = np.asarray(call())
+        found[name] = np.asarray(call(), np.float32)
         seconds[name] = time.perf_counter() - start
-        found[name] = torch.from_numpy(values[known].astype(np.float32))
+    return found, seconds
+
+
+def score(sources: Sources, case: Case) -> tuple[dict[str, Tensor], Tensor, dict[str, float]]:
+    """Every measure of one map and its errors where map and truth are known, and the seconds of each measure."""
+    views = read_case(sources, case)
+    truth = np.where(np.isfinite(views.disparity0), views.disparity0, np.nan)
+    count = int(np.clip(np.ceil(1.25 * np.nanquantile(truth, 0.999) / 16) * 16, 32, 256))
+    run = make_methods(load_matching(sources.folder, case.number or 0))[case.method]
+    both = both_maps(run, views.image0, views.image1, count)
+    network, ccnn = load_network(case.network), load_ccnn(case.ccnn)
+    maps, seconds = score_maps(views, both, network, ccnn, case.max_error_px)
+    error = np.abs(both[0] - truth)
+    known = np.isfinite(error)
+    found = {name: torch.from_numpy(values[known]) for name, values in maps.items()}
     return found, torch.from_numpy(error[known]), seconds
 
 
@@ -218,6 +229,16 @@ def main() -> None:
             )
     suite.write()
     draw_curves(suite.records)
+    show_rendered(sources.folder)
+
+
+def show_rendered(folder: Path) -> None:
+    """Draw the measures of a semi-global map of a rendered pair, which no training has seen."""
+    scene = render_scene(5, SyntheticConfig(width_px=480, height_px=360, max_disparity_px=60, noise_levels=3))
+    views = Views(scene.image0[0].numpy(), scene.image1[0].numpy(), scene.disparity0.numpy(), None)
+    both = both_maps(make_methods(load_matching(folder, 0))["sgbm"], views.image0, views.image1, 80)
+    maps, _ = score_maps(views, both, load_confidence(), load_ccnn(folder / "ccnn.safetensors"), 1.0)
+    draw_maps(np.abs(both[0] - views.disparity0), maps, views.image0)
 
 
 if __name__ == "__main__":

@@ -45,3 +45,22 @@ def draw_curves(records: list[dict[str, Any]]) -> None:
     for axis in axes[:, 0]:
         axis.set_ylabel("wrong ones among them, %")
     save_figure(figure, "confidence_curves")
+
+
+def draw_maps(error: np.ndarray, maps: dict[str, np.ndarray], view: np.ndarray) -> None:
+    """results/confidence_maps.png: a view, the errors of its map, and the confidence of every measure by rank."""
+    known = np.isfinite(error)
+    panels = {"view 0": (view, {"cmap": "gray"}), "error, 0 to 4 px": (error, {"cmap": "magma", "vmin": 0, "vmax": 4})}
+    for name, values in maps.items():
+        ranks = np.searchsorted(np.sort(values[known]), values) / known.sum()
+        panels[name] = np.where(known, ranks, np.nan), {"cmap": "cividis"}
+    columns = 4
+    rows = -(-len(panels) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(14, 2.9 * rows), constrained_layout=True)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, (name, (values, style)) in zip(axes.flat, panels.items(), strict=False):
+        axis.imshow(values, **style)
+        axis.set_title(name, fontsize=10)
+    figure.suptitle("a semi-global map of a rendered pair: its errors, and what each measure trusts (bright), by rank")
+    save_figure(figure, "confidence_maps")

@@ -11,7 +11,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from multiprocessing import active_children
 from pathlib import Path
 
@@ -21,9 +22,13 @@ import polars as pl
 from tensor_stereo.configs import SweepConfig, TrialConfig
 from tensor_stereo.datasets import build_manifest, read_manifest, write_manifest, write_synthetic
 from tensor_stereo.datasets.pair_table import PairTable
+from tensor_stereo.evaluation.rows import STAGES
 from tensor_stereo.sweeps import SweepProgress, build_plan, run_sweep
-from tensor_stereo.sweeps.batches import METRICS_SCHEMA, make_batch
-from tensor_stereo.sweeps.store import RunStore
+from tensor_stereo.sweeps.batches import METRICS_SCHEMA, BatchResult, make_batch
+from tensor_stereo.sweeps.driver import drive
+from tensor_stereo.sweeps.plan import Task
+from tensor_stereo.sweeps.ray_engine import RayEngine
+from tensor_stereo.sweeps.store import FORMAT, RunStore
 from tensor_stereo.sweeps.units import run_tasks
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
@@ -76,6 +81,25 @@ def plain_calls(manifest: Path) -> float:
     for unit in range(plan.num_units):
         run_tasks(CONFIG, [plan.task(unit)])
     return (time.perf_counter() - start) / plan.num_units
+
+
+def trivial(_: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
+    """A row without any work for every unit."""
+    row = dict.fromkeys(METRICS_SCHEMA) | {"trial": 0, "seconds": dict.fromkeys(STAGES, 0.0)}
+    return make_batch([row | {"unit": task.unit, "scene": task.files.scene} for task in tasks])
+
+
+def driver_rate(manifest: Path, folder: Path, count: int) -> float:
+    """Units per second of ``count`` that do nothing, through Ray, the driver and the run folder."""
+    pairs = PairTable(manifest, check_files=False)
+    plan = build_plan(CONFIG, pairs)
+    units = plan.shard(1, 1)[:count]
+    record = {"format": FORMAT, "sweep": asdict(CONFIG), "manifest": {"num_pairs": len(pairs)}}
+    engine = RayEngine(CONFIG, 2, run=trivial)
+    start = time.perf_counter()
+    with RunStore(folder / "trivial", record, pairs) as store:
+        drive(engine, plan, store, units, units)
+    return count / (time.perf_counter() - start)
 
 
 def main() -> None:

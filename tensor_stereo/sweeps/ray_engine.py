@@ -8,10 +8,11 @@ was at is run again by the sweep, which counts the attempts.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tensor_stereo.configs import SweepConfig
+from tensor_stereo.sweeps.batches import BatchResult
 from tensor_stereo.sweeps.engines import Outcome, run_batch
 from tensor_stereo.sweeps.plan import Task
 from tensor_stereo.waiting import chosen_policy
@@ -37,13 +38,21 @@ class RayEngine:
         num_workers: batches that run at a time, one CPU each; None: all CPUs of the cluster.
         address: of a running cluster, as ``ray start`` prints it, or ``auto``; None: the one that this process is
             connected to, else a new one on this machine.
+        run: what a worker does with a batch.
 
     Raises:
         ImportError: if Ray is not installed.
         ConnectionError: if there is no cluster at ``address``.
     """
 
-    def __init__(self, config: SweepConfig, num_workers: int | None = None, address: str | None = None) -> None:
+    def __init__(
+        self,
+        config: SweepConfig,
+        num_workers: int | None = None,
+        address: str | None = None,
+        *,
+        run: Callable[[SweepConfig, Sequence[Task]], BatchResult] = run_batch,
+    ) -> None:
         self._ray = ray = find_ray()
         self._started = not ray.is_initialized()
         if self._started:
@@ -51,7 +60,7 @@ class RayEngine:
             ray.init(address=address or "local", log_to_driver=False, configure_logging=False, **local)
         self.num_workers = num_workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._config = ray.put(config)
-        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": chosen_policy()})(run_batch)
+        self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": chosen_policy()})(run)
         self._running: dict[Any, tuple[Task, ...]] = {}
 
     def submit(self, tasks: Sequence[Task]) -> None:
@@ -61,7 +70,10 @@ class RayEngine:
         ray = self._ray
         if not self._running:
             return []
-        done, _ = ray.wait(list(self._running), num_returns=1, timeout=timeout_seconds)
+        running = list(self._running)
+        done, _ = ray.wait(running, num_returns=1, timeout=timeout_seconds)
+        if done:  # and all others that have ended meanwhile
+            done, _ = ray.wait(running, num_returns=len(running), timeout=0)
         outcomes = []
         for reference in done:
             tasks = self._running.pop(reference)

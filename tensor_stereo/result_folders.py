@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import IO, Any, Generic, NamedTuple, TypeVar
 
 from tensor_stereo.atomic import append_line, drop_torn_line, whole_file
 from tensor_stereo.locks import lock
@@ -25,11 +25,13 @@ class Source(NamedTuple):
         name: Of the result, for the journal and for errors; unique in its folder.
         inputs: Files that the result depends on.
         results: Files that are written; those that exist tell that it is done.
+        settings: What else the result depends on, as JSON; None: nothing.
     """
 
     name: str
     inputs: tuple[Path, ...]
     results: tuple[Path, ...]
+    settings: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class ResultFolder(Generic[Summary]):
         sources: Sequence[Source],
         run: Callable[[int], Summary],
         on_progress: Callable[[int, int, str], None] | None = None,
+        on_end: Callable[[dict[str, Summary]], None] | None = None,
     ) -> Worked[Summary]:
         """Make the results that are not there, or whose sources have changed; those that failed are tried again.
 
@@ -85,42 +88,60 @@ class ResultFolder(Generic[Summary]):
             sources: All of them.
             run: Makes the result of a source, by its number, and tells of it.
             on_progress: Called after each source with the number of sources done, their total and the name.
+            on_end: Called with the summaries at the end, also that by an error, while the folder is locked.
 
         Raises:
             ValueError: If another call works on the folder, or it holds results of other settings.
             OSError: If nothing can be written to it.
         """
         worked: Worked[Summary] = Worked()
-        num_found = 0
         with self.journal_file.open("ab", buffering=0) as journal:
             if not lock(journal):
                 raise ValueError(f"out: another call works on {self.out}; wait for it or name another folder")
             self._claim()
             drop_torn_line(journal, self.journal_file)
             known = self._read_journal()
-            for number, source in enumerate(sources):
-                entry, stamp = known.get(source.name), _stamp(source.inputs)
-                if entry is not None and entry["stamp"] == stamp and _sizes(source.results) == entry["size"]:
-                    num_found += 1
-                    worked.summaries[source.name] = self._from_json(entry["summary"])
-                else:
-                    try:
-                        summary = run(number)
-                    except _ONE_SOURCE_FAILS as error:
-                        if isinstance(error, OSError) and error.errno in _NO_ROOM:
-                            raise
-                        worked.errors[source.name] = " ".join(str(error).split())
-                        if entry is not None:  # the result of what the source was
-                            for path in source.results:
-                                path.unlink(missing_ok=True)
-                    else:
-                        worked.summaries[source.name] = summary
-                        done = {"name": source.name, "stamp": stamp, "size": _sizes(source.results)}
-                        line = json.dumps(done | {"summary": self._to_json(summary)}, separators=(",", ":"))
-                        append_line(line.encode(), journal)
-                if on_progress is not None:
-                    on_progress(number + 1, len(sources), source.name)
+            try:
+                num_found = self._work(sources, run, on_progress, journal, known, worked)
+            finally:
+                if on_end is not None:
+                    on_end(worked.summaries)
         return Worked(num_found, worked.errors, worked.summaries)
+
+    def _work(
+        self,
+        sources: Sequence[Source],
+        run: Callable[[int], Summary],
+        on_progress: Callable[[int, int, str], None] | None,
+        journal: IO[bytes],
+        known: dict[str, dict[str, Any]],
+        worked: Worked[Summary],
+    ) -> int:
+        """Fill ``worked``; how many sources were done before."""
+        num_found = 0
+        for number, source in enumerate(sources):
+            entry, stamp = known.get(source.name), _stamp(source)
+            if entry is not None and entry["stamp"] == stamp and _sizes(source.results) == entry["size"]:
+                num_found += 1
+                worked.summaries[source.name] = self._from_json(entry["summary"])
+            else:
+                try:
+                    summary = run(number)
+                except _ONE_SOURCE_FAILS as error:
+                    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+                        raise
+                    worked.errors[source.name] = " ".join(str(error).split())
+                    if entry is not None and stamp and stamp != entry["stamp"]:  # of what the source was
+                        for path in source.results:
+                            path.unlink(missing_ok=True)
+                else:
+                    worked.summaries[source.name] = summary
+                    done = {"name": source.name, "stamp": stamp, "size": _sizes(source.results)}
+                    line = json.dumps(done | {"summary": self._to_json(summary)}, separators=(",", ":"))
+                    append_line(line.encode(), journal)
+            if on_progress is not None:
+                on_progress(number + 1, len(sources), source.name)
+        return num_found
 
     def _claim(self) -> None:
         """Make this the folder of the settings, or raise if it is that of others."""
@@ -159,10 +180,11 @@ def _sizes(paths: Sequence[Path]) -> int | list[int] | None:
     return sizes if len(sizes) > 1 else sizes[0]
 
 
-def _stamp(paths: Sequence[Path]) -> list[int]:
-    """What changes when a file changes; empty if one is missing."""
+def _stamp(source: Source) -> list[Any]:
+    """What changes when a source changes; empty if a file is missing."""
     try:
-        states = [path.stat() for path in paths]
+        states = [path.stat() for path in source.inputs]
     except OSError:
         return []
-    return [value for state in states for value in (state.st_size, state.st_mtime_ns)]
+    settings = [] if source.settings is None else [source.settings]
+    return [*(value for state in states for value in (state.st_size, state.st_mtime_ns)), *settings]

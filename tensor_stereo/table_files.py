@@ -47,8 +47,12 @@ def read_parquet(path: Path) -> pl.DataFrame:
             raise ValueError(f"{path} is no readable Parquet file: {_one_line(error)}") from error
 
 
-def lazy_parquet(path: Path) -> pl.LazyFrame:
+def lazy_parquet(path: Path, *, check: bool = True) -> pl.LazyFrame:
     """A Parquet file as a lazy table, after the same checks as by :func:`read_parquet`.
+
+    Args:
+        path: The file.
+        check: False for a file of this process's own.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -56,7 +60,8 @@ def lazy_parquet(path: Path) -> pl.LazyFrame:
     """
     path.open("rb").close()
     check_name(path)
-    _DECODER.check(path)
+    if check:
+        _DECODER.check(path)
     return pl.scan_parquet(path.absolute(), glob=False, hive_partitioning=False)
 
 
@@ -153,6 +158,18 @@ def write_table(table: pl.DataFrame, target: Path | IO[bytes], ending: str = "")
         raise OSError(f"{target} cannot be written: {error}") from error
 
 
+def write_lazy(table: pl.LazyFrame, path: Path) -> None:
+    """Write a lazy table as Parquet, a part at a time.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    try:
+        table.sink_parquet(path)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException) as error:
+        raise OSError(f"{path} cannot be written: {error}") from error
+
+
 class _Decoder:
     """Decodes Parquet files in a process of its own first.
 
@@ -167,7 +184,7 @@ class _Decoder:
     def check(self, path: Path) -> None:
         """Raise ValueError unless a file can be decoded and has at most ``MAX_ROWS`` rows."""
         with self._lock:
-            answer = self._ask(path)
+            answer = self._ask(path) or self._ask(path)  # something else may have ended it
         if answer is None:
             raise ValueError(f"{path} is no readable Parquet file: it ends the decoder")
         if answer.get("num_rows", 0) > MAX_ROWS:
@@ -225,9 +242,11 @@ for line in sys.stdin:
         with open(path, "rb") as file:
             table = pl.scan_parquet(file, glob=False, hive_partitioning=False)
             answer["num_rows"] = table.select(pl.len()).collect().item()
-        if answer["num_rows"] <= max_rows:
-            for batch in pl.scan_parquet(path, glob=False, hive_partitioning=False).collect_batches(chunk_size=1 << 16):
-                pass
+            if answer["num_rows"] <= max_rows:
+                file.seek(0)
+                table = pl.scan_parquet(file, glob=False, hive_partitioning=False)
+                for batch in table.collect_batches(chunk_size=1 << 16):
+                    pass
     except BaseException as error:
         answer["error"] = " ".join(str(error).strip().split("\\n", 1)[0].split())
     print(json.dumps(answer), flush=True)

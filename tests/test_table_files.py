@@ -93,16 +93,22 @@ def test_a_missing_file_is_told_from_a_damaged_one(tmp_path: Path) -> None:
         read_parquet(tmp_path / "a.parquet")
 
 
-def test_a_decoder_that_dies_costs_one_file(tmp_path: Path) -> None:
+def test_a_file_that_ends_the_decoder_is_refused_and_costs_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.parquet"
     write_table(TABLE, path)
     read_parquet(path)
     process = table_files._DECODER._process
     assert process is not None
-    process.kill()
+    process.kill()  # something else did it
     process.wait()
-    with pytest.raises(ValueError, match="it ends the decoder"):
-        read_parquet(path)
+    assert read_parquet(path).rows() == TABLE.rows()
+    table_files._DECODER.stop()
+    with monkeypatch.context() as patch:
+        patch.setattr(table_files, "_DECODE", "import os; input(); os._exit(1)")
+        with pytest.raises(ValueError, match="it ends the decoder"):
+            read_parquet(path)
     assert read_parquet(path).rows() == TABLE.rows()
 
 

@@ -66,6 +66,8 @@ def _check_confidence(command: Confidence) -> None:
     if command.is_manifest:
         _check_maps(command)
         return
+    if command.ending is not None:
+        raise ValueError("ending must not be given without a manifest: that of --out counts")
     for name in ("right", "disparity"):
         if getattr(command, name) is None:
             raise ValueError(f"{name} must be given beside left, unless left is a manifest, .csv or .parquet")

@@ -92,8 +92,8 @@ class Confidence:
     out: Path | None = None
     """File of the probabilities: .pfm, .png (16 bits, 65535 is 1), .npy or .tiff. For a manifest the folder of such
     files, one per pair, and of confidence.parquet, one row per pair."""
-    ending: Literal[".png", ".pfm", ".npy", ".tiff"] = ".png"
-    """Of the files in that folder."""
+    ending: Literal[".png", ".pfm", ".npy", ".tiff"] | None = None
+    """Of the files in that folder; .png if not given."""
     figure: Path | None = None
     """PNG of the map, its confidence, what is kept and, with ground truth, its errors."""
 

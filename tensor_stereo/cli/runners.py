@@ -237,12 +237,13 @@ def _run_confidence(command: Confidence) -> int:
 def _run_confidence_of_manifest(command: Confidence) -> int:
     from tensor_stereo.reports.confidence_folder import confidence_table, score_disparity_manifest
 
-    taken = ("ending", "unknown", "max_error_px", "max_error_share", "stride", "threshold", "min_precision")
+    taken = ("unknown", "max_error_px", "max_error_share", "stride", "threshold", "min_precision")
     begun = time.monotonic()
     with show_progress("confidence") as show:
         summary = score_disparity_manifest(
             command.left,
             command.out,  # type: ignore[arg-type]
+            ending=command.ending or ".png",
             **{name: getattr(command, name) for name in taken},
             on_progress=lambda done, total, name: show(done, total, f"{name}, {time_left(begun, done, total)}"),
         )

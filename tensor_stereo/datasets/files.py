@@ -20,6 +20,7 @@ IMAGE_ENDINGS = (".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp", ".webp", ".jpg
 SAMPLE_BITS = Within(8, 16)
 ESTIMATES = ("disparity_est", "disparity1_est")
 PATHS = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask", "calibration", *ESTIMATES)  # of PairFiles
+READ = ("image0", "image1", "disparity_gt", "disparity_noc_gt", "mask")  # of these, what a pair is read from
 SCALES = ("gt_scale", "est_scale")
 
 MAX_DEPTH = 6  # data/middlebury/scenes2005/FullSize/zip-2views/Art, with one level to spare

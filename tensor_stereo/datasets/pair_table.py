@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import copy
 import filecmp
 import math
 import os
@@ -28,7 +29,7 @@ from tensor_stereo.datasets.files import (
 from tensor_stereo.datasets.pair_lists import read_list
 from tensor_stereo.datasets.remote import fetch, is_url, to_location
 from tensor_stereo.paths import has_ending
-from tensor_stereo.table_files import lazy_parquet
+from tensor_stereo.table_files import lazy_parquet, write_lazy
 
 SCHEMA: dict[str, Any] = {
     "dataset": pl.String,  # release, e.g. middlebury-2005
@@ -127,10 +128,16 @@ class PairTable:
         if len(self._parts) == 1 and has_ending(self._parts[0].path, ".parquet"):
             shutil.copyfile(self._parts[0].path, path)
             return
-        try:
-            self.rows().sink_parquet(path)
-        except pl.exceptions.PolarsError as error:
-            raise OSError(f"{path} cannot be written: {error}") from error
+        write_lazy(self.rows(), path)
+
+    def moved_to(self, path: Path) -> PairTable:
+        """The same pairs, read from a copy that :meth:`copy_to` has written, or that :meth:`first_difference` knows."""
+        table = copy.copy(self)
+        table.path = path
+        rows = _complete(path, lazy_parquet(path, check=False))
+        table._parts, table._starts = [_Part(path, rows, 0)], [0]
+        table._window = 0, pl.DataFrame(schema=SCHEMA)
+        return table
 
     def find(self, dataset: str, scene: str) -> PairFiles:
         """The pair of a name.
@@ -172,7 +179,7 @@ class PairTable:
         twice = self.rows().filter(names.is_duplicated()).select("dataset", "scene", "image0").collect()
         if len(twice):
             dataset, scene, image0 = twice.row(0)
-            other = twice[1:].row(by_predicate=(pl.col("dataset") == dataset) & (pl.col("scene") == scene))
+            other = twice[1:].filter(pl.col("dataset") == dataset, pl.col("scene") == scene).row(0)
             raise two_of_one_name(dataset, scene, image0, other[2])
 
     def _check_files(self) -> None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from tensor_stereo.datasets.files import PATHS, Location, PairFiles
+from tensor_stereo.datasets.files import READ, Location, PairFiles
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 _ANY_ERROR = Exception  # what the packages behind fsspec raise has no common base
@@ -62,10 +63,10 @@ def beside(listed: Location, name: str) -> Location:
     >>> beside("s3://bucket/pairs/list.csv", "left.png")
     's3://bucket/pairs/left.png'
     """
-    if is_url(name):
+    if is_url(name) or Path(name).is_absolute():
         return to_location(name)
     if isinstance(listed, Path):
-        return listed.parent / name
+        return Path(os.path.normpath(listed.absolute().parent / name))
     return f"{listed.rsplit('/', 1)[0]}/{name}"
 
 
@@ -94,7 +95,8 @@ def fetch(url: str, folder: Path, *, tables: bool = False) -> Path:
             for found in store.glob(f"{path}/*.parquet"):
                 store.get_file(found, str(local / found.rsplit("/", 1)[-1]))
             return local
-        local = folder / unquote(urlsplit(url).path).rsplit("/", 1)[-1]
+        name = str(path).rstrip("/").rsplit("/", 1)[-1]
+        local = folder / (name.split("?", 1)[0] if url.lower().startswith("http") else name)
         store.get_file(path, str(local))
     except FileNotFoundError as error:
         raise FileNotFoundError(f"there is no file {url}") from error
@@ -106,23 +108,30 @@ def fetch(url: str, folder: Path, *, tables: bool = False) -> Path:
 
 
 @contextmanager
-def fetched(files: PairFiles) -> Iterator[PairFiles]:
-    """The same files, those of URLs as local copies for as long as the block runs; errors name the URLs.
+def fetched(files: PairFiles, names: Sequence[str] = READ) -> Iterator[PairFiles]:
+    """The same files, some of those of URLs as local copies for as long as the block runs; errors name the URLs.
+
+    Args:
+        files: Of a pair.
+        names: Which are needed, of ``PATHS``.
 
     >>> with fetched(PairFiles("mine", "a", Path("a.png"), Path("b.png"))) as local:
     ...     local.image0.name
     'a.png'
     """
-    remote = {name: url for name in PATHS if is_url(url := getattr(files, name) or "")}
+    remote = {name: url for name in names if is_url(url := getattr(files, name) or "")}
     if not remote:
         yield files
         return
     with tempfile.TemporaryDirectory(prefix="tensor-stereo-") as folder:
         local: dict[str, Any] = {}
+        copies: dict[str, Path] = {}
         for name, url in remote.items():
-            place = Path(folder, name)
-            place.mkdir()
-            local[name] = fetch(url, place)
+            if url not in copies:
+                place = Path(folder, name)
+                place.mkdir()
+                copies[url] = fetch(url, place)
+            local[name] = copies[url]
         try:
             yield replace(files, **local)
         except (ValueError, OSError) as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.atomic import whole_file
-from tensor_stereo.datasets.files import PairFiles
+from tensor_stereo.datasets.files import ESTIMATES, PATHS, READ, PairFiles
 from tensor_stereo.datasets.manifest import read_manifest
 from tensor_stereo.datasets.map_files import read_map, write_confidence
+from tensor_stereo.datasets.pair_table import pair_row
 from tensor_stereo.datasets.pairs import read_pair
 from tensor_stereo.datasets.remote import fetched, local_paths
-from tensor_stereo.dense.confidence import DisparityConfidence, check_verdict
+from tensor_stereo.dense.confidence import WEIGHTS, DisparityConfidence, check_verdict
 from tensor_stereo.paths import MAPS, TABLES, check_ending, check_source, prepare_folder
 from tensor_stereo.reports.confidence import RATES, ConfidenceSummary, summarize_confidence
 from tensor_stereo.reports.tables import Table
@@ -97,11 +98,12 @@ def score_disparity_manifest(
     confidence = DisparityConfidence(max_error_px, max_error_share, stride)
     tolerance = {"max_error_px": max_error_px, "max_error_share": max_error_share}
     verdict = {"threshold": threshold, "min_precision": min_precision}
-    settings = tolerance | verdict | {"stride": stride, "unknown": unknown, "ending": ending}
+    weights = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
+    settings = tolerance | verdict | {"stride": stride, "unknown": unknown, "ending": ending, "weights": weights}
 
     def run(number: int) -> ConfidenceSummary:
         result = sources[number].results[0]
-        with fetched(pairs[number]) as files:
+        with fetched(pairs[number], (*READ, *ESTIMATES)) as files:
             pair = read_pair(files)
             given, other = (
                 None if path is None else _read(name, Path(path), files.est_scale, unknown)
@@ -116,10 +118,14 @@ def score_disparity_manifest(
     folder: ResultFolder[ConfidenceSummary] = ResultFolder(
         out, KIND, settings, to_json=asdict, from_json=lambda values: ConfidenceSummary(**values)
     )
-    worked = folder.work(sources, run, on_progress)
-    table, frame = out / f"{KIND}.parquet", confidence_frame(worked.summaries, pairs)
-    with whole_file(table) as part:
-        write_table(frame, part)
+    table = out / f"{KIND}.parquet"
+
+    def write(summaries: Mapping[str, ConfidenceSummary]) -> None:
+        with whole_file(table) as part:
+            write_table(confidence_frame(summaries, pairs), part)
+
+    worked = folder.work(sources, run, on_progress, write)
+    frame = confidence_frame(worked.summaries, pairs)
     return ManifestSummary(len(pairs), worked.num_found, worked.errors, frame, table)
 
 
@@ -144,23 +150,29 @@ def find_maps(manifest: Path, out: Path, ending: str) -> tuple[list[PairFiles], 
     pairs = read_manifest(manifest, check_files=False)
     if not pairs:
         raise ValueError(f"manifest: {manifest} lists no pair")
-    taken: dict[Path, str] = {}
+    taken: dict[Path, PairFiles] = {}
     sources = []
+    read: set[Path] = set()
     for pair in pairs:
         name = f"{pair.dataset}/{pair.scene}"
         if pair.disparity_est is None:
             raise ValueError(f"manifest: {manifest} must name a disparity_est for every pair, {name} has none")
-        maps = (pair.disparity_est, pair.disparity1_est, pair.disparity_gt)
-        inputs = local_paths(pair.image0, pair.image1, *maps)  # what has changed elsewhere nobody asks
+        inputs = local_paths(*(getattr(pair, key) for key in PATHS))
+        read |= {path.resolve() for path in inputs}
         result = out / f"{name}{ending}"
-        place = Path(os.path.normpath(result.absolute()))
-        if not place.is_relative_to(os.path.normpath(out.absolute())):
+        place = result.resolve()
+        if not place.is_relative_to(out.resolve()):
             raise ValueError(f"manifest: {manifest} must have names of pairs that stay below out, got {name!r}")
-        if taken.setdefault(place, name) != name:
-            raise ValueError(f"manifest: {manifest} names {taken[place]} and {name}, whose results would have one name")
-        if place in {path.absolute() for path in inputs}:
-            raise ValueError(f"out must be another folder than that of the maps, {place} would be replaced")
-        sources.append(Source(name, inputs, (result,)))
+        other = taken.setdefault(place, pair)
+        if other is not pair:
+            names = f"{other.dataset}/{other.scene} and {name}"
+            raise ValueError(f"manifest: {manifest} names {names}, whose results would have one name")
+        sources.append(Source(name, inputs, (result,), pair_row(pair)))
+    replaced = next((place for place in taken if place in read), None)
+    if replaced is not None:
+        raise ValueError(
+            f"out must be another folder than that of the files of the pairs, {replaced} would be replaced"
+        )
     return pairs, sources
 
 

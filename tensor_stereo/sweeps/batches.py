@@ -45,12 +45,14 @@ class BatchResult(NamedTuple):
         errors: one record with the fields of ``ERRORS_SCHEMA`` for each other unit.
         metrics: the rows, with the columns of ``METRICS_SCHEMA``.
         matches: the matches of all rows, with the columns of ``MATCHES_SCHEMA``; None if the sweep does not keep them.
+        seconds: that the batch took.
     """
 
     done: tuple[int, ...]
     errors: tuple[dict[str, Any], ...]
     metrics: pl.DataFrame
     matches: pl.DataFrame | None = None
+    seconds: float = 0.0
 
     @property
     def num_units(self) -> int:
@@ -61,6 +63,7 @@ def make_batch(
     rows: Sequence[dict[str, Any]],
     errors: Sequence[dict[str, Any]] = (),
     matches: Sequence[pl.DataFrame] | None = None,
+    seconds: float = 0.0,
 ) -> BatchResult:
     """Put the rows, the failures and the matches of some units together.
 
@@ -71,4 +74,4 @@ def make_batch(
     stored = None
     if matches is not None:
         stored = pl.concat(matches) if matches else pl.DataFrame(schema=MATCHES_SCHEMA)
-    return BatchResult(done, tuple(errors), pl.DataFrame(rows, METRICS_SCHEMA), stored)
+    return BatchResult(done, tuple(errors), pl.DataFrame(rows, METRICS_SCHEMA), stored, seconds)

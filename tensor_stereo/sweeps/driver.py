@@ -25,6 +25,7 @@ from tensor_stereo.sweeps.store import RunStore
 MAX_DEATHS = 2  # workers that certainly died at a unit before it counts as failed
 BATCH_SECONDS = 1.0  # about: long against the way to a worker and back, short against a user's patience
 MAX_BATCH = 256
+_RECENT = 16  # batches that tell how long a unit takes
 BATCHES_AHEAD = 1  # that wait for each worker, so that none waits for the driver
 LOG = logging.getLogger(__name__)
 Units = NDArray[np.int64]
@@ -108,9 +109,10 @@ class _Driver:
         self._num_failed = int(store.state.failed(np.setdiff1d(units, todo, assume_unique=True)).sum())
         self._todo, self._next = todo, 0
         self._suspects: deque[Task] = deque()  # a worker may have died at each
+        self._returned: deque[Task] = deque()  # that a batch had no time for
         self._deaths: Counter[int] = Counter()
         self._begun = time.monotonic()
-        self._measured: tuple[float, int] | None = None  # since when units are counted for their time, and from where
+        self._recent: deque[tuple[int, float]] = deque(maxlen=_RECENT)  # units and seconds of the last batches
 
     def progress(self) -> SweepProgress:
         done = self._num_found + self._num_new
@@ -124,8 +126,7 @@ class _Driver:
         with self._stop_on_signals():
             while under_way or (not self.stopping and self._is_waiting()):
                 while not self.stopping and under_way < most and self._is_waiting():
-                    alone = [self._suspects.popleft()] if self._suspects else None
-                    engine.submit(alone or self._next_batch(engine.num_workers))
+                    engine.submit(self._next_batch(engine.num_workers))
                     under_way += 1
                 for outcome in engine.collect(timeout_seconds=0.5):
                     under_way -= 1
@@ -134,7 +135,7 @@ class _Driver:
         self._store.flush()
 
     def _is_waiting(self) -> bool:
-        return self._next < len(self._todo) or bool(self._suspects)
+        return self._next < len(self._todo) or bool(self._suspects or self._returned)
 
     def _take(self, outcome: Outcome) -> None:
         """Store the results of a batch, or try its units again one by one."""
@@ -150,6 +151,10 @@ class _Driver:
                 else:
                     self._suspects.append(task._replace(attempt=task.attempt + 1))
             result = make_batch([], failed, [] if self._plan.config.export_matches else None)
+        else:
+            told = {*result.done, *(error["unit"] for error in result.errors)}
+            self._returned.extend(task for task in outcome.tasks if task.unit not in told)
+            self._recent.append((result.num_units, result.seconds))
         self._num_new += result.num_units
         self._num_failed += len(result.errors)
         for error in result.errors:
@@ -161,26 +166,25 @@ class _Driver:
             LOG.warning("outside of the domain", extra={**names, "domain": domains})
         if result.num_units:
             self._store.add(result)
-        if self._measured is None:
-            self._measured = time.monotonic(), self._num_new
         if self._on_progress is not None:
             self._on_progress(self.progress())
 
     def _next_batch(self, num_workers: int) -> list[Task]:
-        """Units worth about a second, fewer when little is left."""
-        fair = math.ceil((len(self._todo) - self._next) / (2 * num_workers))
-        size = max(1, min(self._units_of(BATCH_SECONDS, num_workers), fair, MAX_BATCH))
-        units = self._todo[self._next : self._next + size].tolist()
-        self._next += size
+        """A unit at which a worker may have died, alone; or units worth about a second, fewer when little is left."""
+        if self._suspects:
+            return [self._suspects.popleft()]
+        left = len(self._returned) + len(self._todo) - self._next
+        size = max(1, min(self._units_of(BATCH_SECONDS), math.ceil(left / (2 * num_workers)), MAX_BATCH))
+        tasks = [self._returned.popleft() for _ in range(min(size, len(self._returned)))]
+        units = self._todo[self._next : self._next + size - len(tasks)].tolist()
+        self._next += len(units)
         failed = self._store.state.errors
-        return [self._plan.task(unit, 1 + failed.get(unit, {}).get("attempts", 0)) for unit in units]
+        return tasks + [self._plan.task(unit, 1 + failed.get(unit, {}).get("attempts", 0)) for unit in units]
 
-    def _units_of(self, seconds: float, num_workers: int) -> int:
-        """How many units a worker does in some seconds; 1 before anything is known: the first ones wait for imports."""
-        if self._measured is None:
-            return 1
-        since, before = self._measured
-        return int(seconds * (self._num_new - before) / max(num_workers * (time.monotonic() - since), 1e-6))
+    def _units_of(self, seconds: float) -> int:
+        """How many units a worker does in some seconds, by its last batches; 1 before anything is known."""
+        units, spent = (sum(values) for values in zip(*self._recent, strict=True)) if self._recent else (0, 1.0)
+        return int(seconds * units / max(spent, 1e-6))
 
     @contextmanager
     def _stop_on_signals(self) -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
@@ -189,6 +190,7 @@ def _work(connection: Connection, config: SweepConfig) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the parent decides when to stop
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    importlib.import_module("tensor_stereo.sweeps.units")  # a worker without it has not begun
     connection.send(None)
     while True:
         try:

@@ -8,6 +8,7 @@ was at is run again by the sweep, which counts the attempts.
 from __future__ import annotations
 
 import importlib
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -62,9 +63,16 @@ class RayEngine:
         self._config = ray.put(config)
         self._task = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": chosen_policy()})(run)
         self._running: dict[Any, tuple[Task, ...]] = {}
+        self._waiting: deque[tuple[Task, ...]] = deque()
 
     def submit(self, tasks: Sequence[Task]) -> None:
-        self._running[self._task.remote(self._config, tuple(tasks))] = tuple(tasks)
+        self._waiting.append(tuple(tasks))
+        self._dispatch()
+
+    def _dispatch(self) -> None:
+        while self._waiting and len(self._running) < self.num_workers:
+            batch = self._waiting.popleft()
+            self._running[self._task.remote(self._config, batch)] = batch
 
     def collect(self, timeout_seconds: float) -> list[Outcome]:
         ray = self._ray
@@ -83,6 +91,7 @@ class RayEngine:
                 raise  # not of a unit: these are caught where they run
             except ray.exceptions.RayError:  # the worker, its node or its memory is gone
                 outcomes.append(Outcome(tasks, None))
+        self._dispatch()
         return outcomes
 
     def close(self) -> None:

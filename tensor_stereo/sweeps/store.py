@@ -6,7 +6,7 @@
     RUN/journal-1-of-1.jsonl one line per part: its files with size and hash, the units that it holds
     RUN/metrics/part-*.parquet   one row per unit and trial
     RUN/matches/part-*.parquet   one row per match, if the sweep keeps them
-    RUN/errors.parquet       one row per failed unit
+    RUN/errors.parquet       one row per failed unit, written when a process begins and ends
     RUN/log.jsonl            what happened when
 
 A part is written when the oldest result in it is ``seconds_per_part`` old, or when it is full: to a temporary file,
@@ -20,7 +20,6 @@ import hashlib
 import io
 import json
 import logging
-import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -45,7 +44,6 @@ from tensor_stereo.table_files import write_table
 
 LOG = logging.getLogger(__name__)
 _MAX_ROWS = 20_000  # that wait for their part, about 80 MB; a hundred matches weigh as much as a row
-_ERRORS_SECONDS = 60.0  # between two writings of the table of errors, which journals hold anyway
 _FOLDERS = ("metrics", "matches")
 FORMAT = 3  # of the run folder; another number when settings or columns are renamed, removed or change their meaning
 
@@ -86,7 +84,6 @@ class RunStore:
         self._pending: list[BatchResult] = []
         self._num_units = self._num_rows = 0
         self._oldest = time.monotonic()  # of what waits
-        self._errors_at = -math.inf
         out.mkdir(parents=True, exist_ok=True)
         with run_lock(out):
             _claim(out, config, manifest)
@@ -106,7 +103,8 @@ class RunStore:
     def __exit__(self, *exception: object) -> None:
         try:
             self.flush()
-            self._write_all_errors()
+            with run_lock(self.out):
+                self._write_errors()
         finally:
             self._journal.close()
 
@@ -151,17 +149,9 @@ class RunStore:
         entry = {"files": files, "done": done, "errors": errors}
         append(entry, self._journal)
         self._pending.clear()
-        failed_before = self.state.errors.keys() | set()
         enter(entry, self.state)
         self._number += 1
         self._num_units = self._num_rows = 0
-        if self.state.errors.keys() != failed_before and time.monotonic() - self._errors_at > _ERRORS_SECONDS:
-            self._write_all_errors()
-
-    def _write_all_errors(self) -> None:
-        with run_lock(self.out):
-            self._write_errors()
-        self._errors_at = time.monotonic()
 
     def _write_errors(self) -> None:
         """The failed units of all shards, as one table."""

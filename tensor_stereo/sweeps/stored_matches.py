@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -14,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from tensor_stereo.sweeps.batches import MATCHES_SCHEMA, METRICS_SCHEMA
-from tensor_stereo.sweeps.results import finished_parts, scan_parts
+from tensor_stereo.sweeps.results import finished_parts, read_config, scan_parts
 from tensor_stereo.table_files import scan_parquet
 from tensor_stereo.types import Matches
 
@@ -47,20 +46,22 @@ class StoredMatches:
 class MatchDataset(IterableDataset[StoredMatches]):
     """The matches of every pair of a sweep with ``export_matches``, for a ``DataLoader``.
 
-    Each part of the run is read once, by one worker of the loader; a part is held at a time. Without ``shuffle`` the
-    order is that of the parts. Pass ``batch_size=None``, or a ``collate_fn`` that does not stack, and
-    ``multiprocessing_context="spawn"`` with workers: the threads of Polars, which reads the parts, survive no fork.
+    Workers of the loader, and shards, share the parts of the run, each of which is read once; where there are fewer
+    parts than shares they share the pairs of every part. Without ``shuffle`` the order is that of the parts. Pass
+    ``batch_size=None``, or a ``collate_fn`` that does not stack, and ``multiprocessing_context="spawn"`` with workers:
+    the threads of Polars, which reads the parts, survive no fork.
 
     Args:
         run: run folder, finished or not.
         trial: number of the point in ``config.json``.
-        shuffle: whether parts, and pairs within a part, come in a random order, another one in every epoch.
+        shuffle: whether the parts of a share, and the pairs within a part, come in a random order, another one in
+            every epoch; with workers it follows from the generator of the loader.
         seed: of that order.
         shard: (i, n): the i-th of n parts of the data, counted from 1, as for the processes of distributed training.
 
     Raises:
         FileNotFoundError: if ``run`` is no run folder.
-        ValueError: if it keeps no matches, has another format, or ``shard`` is not 1 <= i <= n.
+        ValueError: if it keeps no matches, has no such trial or another format, or ``shard`` is not 1 <= i <= n.
     """
 
     def __init__(
@@ -78,22 +79,29 @@ class MatchDataset(IterableDataset[StoredMatches]):
         self.epoch = 0
         self.parts = finished_parts(run, "matches")
         _check_kept(self.run, self.parts)
+        num_trials = len(read_config(run).trials)
+        if not 0 <= trial < num_trials:
+            raise ValueError(f"trial must be one of the {num_trials} points of {run}, from 0 on, got {trial}")
 
     def __iter__(self) -> Iterator[StoredMatches]:
-        rng = np.random.default_rng([self.seed, self.epoch])
-        self.epoch += 1
-        parts = [self.parts[k] for k in rng.permutation(len(self.parts))] if self.shuffle else self.parts
         loader = get_worker_info()
         worker, workers = (0, 1) if loader is None else (loader.id, loader.num_workers)
-        first, step = (self.shard[0] - 1) * workers + worker, self.shard[1] * workers
-        for part in parts[first::step]:
-            rows = _scan(self.run / "metrics" / part.name, METRICS_SCHEMA).filter(trial=self.trial)
-            names = rows.select("unit", "dataset", "scene", "score").collect().rows()
-            table = _scan(part, MATCHES_SCHEMA).filter(trial=self.trial).collect()
-            of_unit = table.partition_by("unit", as_dict=True, maintain_order=True)
-            order = rng.permutation(len(names)) if self.shuffle else range(len(names))
-            for unit, dataset, scene, score in (names[k] for k in order):
-                yield _to_tensors(dataset, scene, score, of_unit.get((unit,), table.head(0)))
+        rng = np.random.default_rng([self.seed, self.epoch if loader is None else loader.seed])
+        self.epoch += 1
+        share = slice((self.shard[0] - 1) * workers + worker, None, self.shard[1] * workers)
+        by_part = len(self.parts) >= share.step
+        parts = self.parts[share] if by_part else self.parts
+        for k in rng.permutation(len(parts)) if self.shuffle else range(len(parts)):
+            yield from self._of_part(parts[k], slice(None) if by_part else share, rng)
+
+    def _of_part(self, part: Path, share: slice, rng: np.random.Generator) -> Iterator[StoredMatches]:
+        rows = scan_parquet([self.run / "metrics" / part.name], METRICS_SCHEMA).filter(trial=self.trial)
+        names = rows.select("unit", "dataset", "scene", "score").collect().rows()[share]
+        table = scan_parquet([part], MATCHES_SCHEMA).filter(trial=self.trial).collect()
+        of_unit = table.partition_by("unit", as_dict=True, maintain_order=True)
+        for k in rng.permutation(len(names)) if self.shuffle else range(len(names)):
+            unit, dataset, scene, score = names[k]
+            yield _to_tensors(dataset, scene, score, of_unit.get((unit,), table.head(0)))
 
 
 def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -> StoredMatches:
@@ -121,10 +129,6 @@ def read_matches(run: Path | str, dataset: str, scene: str, *, trial: int = 0) -
 def _check_kept(run: Path, parts: Sequence[Path]) -> None:
     if not parts:
         raise ValueError(f"{run} keeps no matches; set export_matches = true above the grid")
-
-
-def _scan(part: Path, schema: dict[str, Any]) -> pl.LazyFrame:
-    return scan_parquet([part], schema)
 
 
 def _to_tensors(dataset: str, scene: str, score_name: str, table: pl.DataFrame) -> StoredMatches:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import time
 import warnings
@@ -25,19 +26,20 @@ from tensor_stereo.sweeps.batches import MATCHES_SCHEMA, BatchResult, make_batch
 from tensor_stereo.sweeps.plan import Task, failed_unit
 from tensor_stereo.types import Features, StereoPair
 
+_MOST_SECONDS = 3.0  # of a batch, after which it begins no further unit
 _IMAGES_HELD = 32  # whose features a worker keeps, for pairs that name them again
 
 
 class FeatureCache:
-    """Features of the images that were last seen, by the files that they come from: each is detected once."""
+    """Features of the images that were last seen, by their contents: each is detected once."""
 
     def __init__(self) -> None:
         self._held: OrderedDict[Hashable, tuple[Features, float]] = OrderedDict()
 
-    def detect(self, files: PairFiles, gray: ImagePair, trial: TrialConfig) -> tuple[tuple[Features, Features], float]:
+    def detect(self, gray: ImagePair, trial: TrialConfig) -> tuple[tuple[Features, Features], float]:
         """Features of both views, and the seconds that they took when they were detected."""
         setting = stage_keys(trial)["detect"]
-        views = [(path, files.sample_bits, setting) for path in (files.image0, files.image1)]
+        views = [(image.shape, hashlib.blake2b(image.numpy().data).digest(), setting) for image in gray]
         for view, image in zip(views, gray, strict=True):
             if view not in self._held:  # each alone, so that no bit depends on which others are held
                 start = time.perf_counter()
@@ -58,9 +60,11 @@ def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
     """Run units one after another, on one thread; the images of a pair are read once for its consecutive units.
 
     An image that several pairs name is detected once, if not too many others came between. No exception leaves: a unit
-    that raises becomes a record, and the next one runs.
+    that raises becomes a record, and the next one runs. When the time of a batch is over, the units that are left are
+    not begun.
     """
     limit_threads()
+    begun = time.monotonic()
     rows: list[dict[str, Any]] = []
     errors = []
     matches: list[pl.DataFrame] = []
@@ -68,7 +72,9 @@ def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
     files: PairFiles | None = None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DomainWarning)  # the rows say it, and with them the log
-        for task in tasks:
+        for number, task in enumerate(tasks):
+            if number and time.monotonic() - begun > _MOST_SECONDS:
+                break
             try:
                 if runner is None or files != task.files:
                     runner = None  # the last pair's images go before the next ones come
@@ -79,12 +85,11 @@ def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
             else:
                 rows += of_unit
                 matches += of_matches
-    return make_batch(rows, errors, matches if config.export_matches else None)
+    return make_batch(rows, errors, matches if config.export_matches else None, time.monotonic() - begun)
 
 
 def _make_runner(files: PairFiles) -> TrialRunner:
-    pair = read_pair(files)
-    return TrialRunner(pair, detect=lambda gray, trial: _FEATURES.detect(files, gray, trial))
+    return TrialRunner(read_pair(files), detect=lambda gray, trial: _FEATURES.detect(gray, trial))
 
 
 def check_trials(config: SweepConfig) -> None:

@@ -114,6 +114,42 @@ def test_it_goes_on_where_it_was(listed: Path, tmp_path: Path, capsys: pytest.Ca
         confidence_folder.score_disparity_manifest(manifest, out, stride=2)
 
 
+def test_another_scale_is_another_result(listed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    confidence_folder.score_disparity_manifest(listed, out)
+    text = listed.read_text()
+    listed.write_text(text.replace("256", "128"))
+    again = confidence_folder.score_disparity_manifest(listed, out)
+    assert (again.num_found, again.errors) == (2, {})
+    changed = pl.read_parquet(out / "confidence.parquet")
+    listed.write_text(text)
+    first = confidence_folder.score_disparity_manifest(listed, out).frame
+    assert changed["epe_px"][0] > 2 * first["epe_px"][0]
+    assert changed[1:].equals(first[1:])
+
+
+def test_files_that_are_away_for_a_while_take_no_result_with_them(listed: Path, tmp_path: Path) -> None:
+    """As those of a disk that is not mounted."""
+    out = tmp_path / "out"
+    confidence_folder.score_disparity_manifest(listed, out)
+    result = (out / "two" / "d.png").read_bytes()
+    (tmp_path / "left2.png").rename(tmp_path / "away.png")
+    summary = confidence_folder.score_disparity_manifest(listed, out)
+    assert (summary.num_found, list(summary.errors)) == (2, ["two/d"])
+    assert (out / "two" / "d.png").read_bytes() == result
+    (tmp_path / "away.png").rename(tmp_path / "left2.png")
+    assert confidence_folder.score_disparity_manifest(listed, out).num_found == 3
+
+
+def test_maps_are_never_replaced(listed: Path, tmp_path: Path) -> None:
+    (tmp_path / "two").mkdir()
+    (tmp_path / "map0.png").rename(tmp_path / "two" / "d.png")
+    listed.write_text(listed.read_text().replace("map0.png", "no/../two/d.png"))
+    (tmp_path / "no").mkdir()
+    with pytest.raises(ValueError, match="out must be another folder"):
+        confidence_folder.score_disparity_manifest(listed, tmp_path)
+
+
 def test_bad_manifests_are_one_line(listed: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = ["--out", str(tmp_path / "out")]
     command = ["confidence", str(listed)]
@@ -124,6 +160,8 @@ def test_bad_manifests_are_one_line(listed: Path, tmp_path: Path, capsys: pytest
     fails([*command, *out, "--figure", "a.png"], capsys, "--figure")
     fails([*command, *out, "--max-error-px", "0"], capsys, "--max-error-px")
     fails(["confidence", str(tmp_path / "left0.png")], capsys, "RIGHT", "manifest")
+    alone = [str(tmp_path / name) for name in ("left0.png", "right0.png", "map0.pfm")]
+    fails(["confidence", *alone, "--ending", ".npy"], capsys, "--ending")
     text = listed.read_text()
     for wrong, words in (
         (text.replace("map2.pfm", ""), ("two/d", "disparity_est")),

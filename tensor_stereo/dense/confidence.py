@@ -82,11 +82,11 @@ class DisparityConfidence(nn.Module):
     """The calibrated probability that every pixel of a disparity map is right, from the map and the two images.
 
     It takes maps of any method: a network of this package looks at hand-made measures (how far the disparities around
-    agree, what two matching costs say at the estimate and at all others, from both views, texture, borders), has
-    learnt from maps of semi-global and block matching and of winners of a census and of grey levels, and its
-    probabilities are calibrated on scenes that it was trained without. Sources of the measures: Hu & Mordohai, PAMI
-    34(11), 2012; Poggi, Tosi & Mattoccia, "Quantitative evaluation of confidence measures in a machine learning
-    world", ICCV 2017.
+    agree, what two matching costs say at the estimate and at all others, from both views, texture, borders). It has
+    learnt from maps of semi-global and block matching, of winners of a census, of grey levels and of a small matching
+    network, of filled and of fitted maps. Its probabilities are calibrated on scenes that it was trained without.
+    Sources of the measures: Hu & Mordohai, PAMI 34(11), 2012; Poggi, Tosi & Mattoccia, "Quantitative evaluation of
+    confidence measures in a machine learning world", ICCV 2017.
 
     Args:
         max_error_px: A pixel is right if its error is at most this, .5 to 12 px,

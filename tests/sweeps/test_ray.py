@@ -58,8 +58,9 @@ def test_two_nodes_give_the_rows_of_one_process(
     assert_same(stored(tmp_path / "run"), expected)
 
 
+@pytest.mark.parametrize("once", range(3))  # what is under way when a node goes differs
 def test_a_killed_worker_and_a_removed_node_lose_no_unit(
-    cluster: Any, inputs: Inputs, expected: pl.DataFrame, tmp_path: Path
+    cluster: Any, inputs: Inputs, expected: pl.DataFrame, tmp_path: Path, once: int
 ) -> None:
     faults = []
 
@@ -76,24 +77,6 @@ def test_a_killed_worker_and_a_removed_node_lose_no_unit(
     assert summary.progress.num_failed == 0
     assert_same(stored(tmp_path / "run"), expected)
     assert (read_results(tmp_path / "run")["attempt"] > 1).any()
-
-
-def test_nodes_that_come_and_go_lose_no_unit(
-    cluster: Any, inputs: Inputs, expected: pl.DataFrame, tmp_path: Path
-) -> None:
-    """Three times the second node is lost, and another one joins."""
-    lost = []
-
-    def fault(_: SweepProgress) -> None:
-        if len(lost) < 3:
-            lost.append(cluster.second)
-            cluster.remove_node(cluster.second)
-            cluster.second = cluster.add_node(num_cpus=1)
-
-    summary = run_sweep(inputs.config, inputs.manifest, tmp_path / "run", engine="ray", on_progress=fault)
-    assert len(lost) == 3
-    assert summary.progress.num_failed == 0
-    assert_same(stored(tmp_path / "run"), expected)
 
 
 def test_without_ray_it_fails_also_when_nothing_is_left_to_do(

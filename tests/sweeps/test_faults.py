@@ -106,7 +106,7 @@ def test_a_signal_finishes_what_is_under_way(
     inputs: Inputs, expected: pl.DataFrame, tmp_path: Path, number: signal.Signals
 ) -> None:
     out = tmp_path / "run"
-    process = _run_script(f"os.kill(os.getpid(), {int(number)}) if state.num_new < 3 else None", inputs, out)
+    process = _run_script(f"os.kill(os.getpid(), {int(number)}) if state.num_new < 2 else None", inputs, out)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130, errors
     before = stored(out)

@@ -151,8 +151,9 @@ class LocalEngine:
 
     def _start_worker(self) -> None:
         ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, self._config), daemon=True)
         with passive_children():
+            settings = theirs, self._config, dict(os.environ)
+            process = self._context.Process(target=_work, args=settings, daemon=True)
             process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
         self._workers[ours] = _Worker(process)
@@ -185,8 +186,15 @@ def _num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _work(connection: Connection, config: SweepConfig) -> None:
-    """What a worker process does until its pipe ends."""
+def _work(connection: Connection, config: SweepConfig, environment: dict[str, str]) -> None:
+    """What a worker process does until its pipe ends.
+
+    Args:
+        connection: its end of the pipe.
+        config: the points of the sweep.
+        environment: of the parent now; that of the server which forked this process may be older.
+    """
+    os.environ.update(environment)
     for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the parent decides when to stop
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -185,12 +185,12 @@ def test_ten_thousand_finished_units_are_found_at_once(tmp_path: Path) -> None:
 
     count = 10_000
     table = pl.DataFrame(
-        {
+        dict.fromkeys(SCHEMA)
+        | {
             "dataset": ["many"] * count,
             "scene": [str(k) for k in range(count)],
             "image0": ["a.png"] * count,
             "image1": ["b.png"] * count,
-            **dict.fromkeys(["disparity_gt", "disparity_noc_gt", "mask", "calibration", "gt_scale", "sample_bits"]),
             "gt_encoding": ["scaled"] * count,
             "width_px": [1] * count,
             "height_px": [1] * count,

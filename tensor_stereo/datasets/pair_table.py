@@ -45,6 +45,7 @@ SCHEMA: dict[str, Any] = {
 }
 OPTIONAL = ("sample_bits", *ESTIMATES, "est_scale")  # not there in manifests of earlier releases
 _REQUIRED = ("dataset", "scene", "image0", "image1", "gt_encoding", "width_px", "height_px")
+_VALUES = ("dataset", "scene", "gt_encoding", "sample_bits", *SCALES)  # of PairFiles, besides its paths
 _ROWS_AT_ONCE = 1 << 15
 
 
@@ -117,7 +118,7 @@ class PairTable:
 
     def rows(self) -> pl.LazyFrame:
         """All rows, with the columns of ``SCHEMA``."""
-        return pl.concat([part.rows for part in self._parts]) if self._parts else pl.LazyFrame(schema=SCHEMA)
+        return pl.concat([part.rows for part in self._parts])
 
     def copy_to(self, path: Path) -> None:
         """Write all rows as one Parquet file.
@@ -203,8 +204,7 @@ def two_of_one_name(dataset: str, scene: str, image0: object, other: object) -> 
 def to_pair(values: dict[str, Any]) -> PairFiles:
     """One row, checked before."""
     paths: dict[str, Any] = {name: None if values[name] is None else to_location(values[name]) for name in PATHS}
-    others = ("dataset", "scene", "gt_encoding", "sample_bits", *SCALES)
-    return PairFiles(**{name: values[name] for name in others}, **paths)
+    return PairFiles(**{name: values[name] for name in _VALUES}, **paths)
 
 
 def _files(given: Location, path: Path, check_files: bool) -> Iterator[tuple[Path, pl.LazyFrame]]:
@@ -228,8 +228,7 @@ def _files(given: Location, path: Path, check_files: bool) -> Iterator[tuple[Pat
 def pair_row(pair: PairFiles) -> dict[str, Any]:
     """A pair as a row, but for the size of its images."""
     paths = {name: getattr(pair, name) for name in PATHS}
-    others = ("dataset", "scene", "gt_encoding", "sample_bits", *SCALES)
-    return {name: getattr(pair, name) for name in others} | {
+    return {name: getattr(pair, name) for name in _VALUES} | {
         name: None if path is None else str(path) for name, path in paths.items()
     }
 

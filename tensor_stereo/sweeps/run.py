@@ -88,7 +88,8 @@ def run_sweep(
         raise ValueError(f"engine must be 'local' or 'ray', got {engine!r}")
     config = replace(config, trials=tuple(simplify(trial) for trial in config.trials))
     pairs = PairTable(manifest, check_files=False)
-    units = build_plan(config, pairs).shard(*shard)
+    plan = build_plan(config, pairs)
+    units = plan.shard(*shard)
     if engine == "ray":
         find_ray()
     if not (out / "config.json").exists():
@@ -103,7 +104,7 @@ def run_sweep(
         seconds_per_part=seconds_per_part,
         verify=verify,
     )
-    plan = build_plan(config, pairs.moved_to(out / "manifest.parquet"))  # whatever becomes of the given one
+    plan = replace(plan, pairs=pairs.moved_to(out / "manifest.parquet"))  # whatever becomes of the given one
     with store, log_to_file(out / "log.jsonl", log_level):
         known = store.state.good.among(units) if retry_errors else store.state.done(units)
         todo = units[~known]

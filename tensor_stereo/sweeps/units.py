@@ -89,7 +89,7 @@ def run_tasks(config: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
 
 
 def _make_runner(files: PairFiles) -> TrialRunner:
-    return TrialRunner(read_pair(files), detect=lambda gray, trial: _FEATURES.detect(gray, trial))
+    return TrialRunner(read_pair(files), detect=_FEATURES.detect)
 
 
 def check_trials(config: SweepConfig) -> None:

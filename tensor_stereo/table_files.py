@@ -231,7 +231,7 @@ class _Decoder:
             process.communicate()
 
 
-# Answers a path with the number of rows that its file claims, then with an error or not.
+# Answers a path with the number of rows that its file claims, and with an error if they cannot be decoded.
 _DECODE = """
 import json, sys
 import polars as pl
@@ -245,8 +245,9 @@ for line in sys.stdin:
             if answer["num_rows"] <= max_rows:
                 file.seek(0)
                 table = pl.scan_parquet(file, glob=False, hive_partitioning=False)
-                for batch in table.collect_batches(chunk_size=1 << 16):
-                    pass
+                found = sum(map(len, table.collect_batches(chunk_size=1 << 16)))  # ends early where a column is cut
+                if found < answer["num_rows"]:
+                    answer["error"] = f"only {found} of its {answer['num_rows']} rows can be decoded"
     except BaseException as error:
         answer["error"] = " ".join(str(error).strip().split("\\n", 1)[0].split())
     print(json.dumps(answer), flush=True)

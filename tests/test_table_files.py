@@ -11,7 +11,7 @@ import pytest
 
 import tensor_stereo
 from tensor_stereo import table_files
-from tensor_stereo.table_files import read_csv, read_parquet, scan_parquet, write_table
+from tensor_stereo.table_files import lazy_parquet, read_csv, read_parquet, scan_parquet, write_table
 from tests.awkward_names import NAMES
 
 TABLE = pl.DataFrame({"x": ["1", "2"], "y": ["a", None]})
@@ -110,6 +110,25 @@ def test_a_file_that_ends_the_decoder_is_refused_and_costs_no_other(
         with pytest.raises(ValueError, match="it ends the decoder"):
             read_parquet(path)
     assert read_parquet(path).rows() == TABLE.rows()
+
+
+def test_a_changed_byte_is_refused_in_one_line_or_harmless(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    # Such files are read whole or not at all, by every reader, and Polars says nothing of its own on standard error.
+    table = pl.DataFrame({"a": [f"text {k}" for k in range(40)], "b": list(range(40))})
+    good, path = tmp_path / "good.parquet", tmp_path / "a.parquet"
+    table.write_parquet(good, compression="uncompressed")
+    content, refused = good.read_bytes(), 0
+    for place in range(4, len(content), 3):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+        try:
+            rows = len(lazy_parquet(path).collect())
+            assert rows == len(read_parquet(path)) == len(table)
+        except ValueError as error:
+            refused += 1
+            assert str(error).startswith(f"{path} is no readable Parquet file: ")
+            assert "\n" not in str(error)
+    assert refused
+    assert not capfd.readouterr().err
 
 
 def test_a_table_that_finds_no_room_is_an_oserror() -> None:

@@ -174,8 +174,8 @@ def _run_report(command: Report) -> int:
         out = command.runs[-1] if len(names) == 1 else command.runs[-1].parent / f"{names[0]}-and-{names[1]}"
     for path in write_report(runs, out):
         print(path)
-    pairs = [set(run.results.select("dataset", "scene").unique().iter_rows()) for run in runs]
-    if len(pairs) == 2 and not pairs[0] & pairs[1]:
+    pairs = [run.rows.units["pair"].unique() for run in runs]
+    if len(pairs) == 2 and not pairs[0].is_in(pairs[1].implode()).any():
         counts = f"{len(pairs[0])} and {len(pairs[1])}"
         return fail(f"{command.runs[0]} and {command.runs[1]} have no pair in common, of {counts}")
     return OK

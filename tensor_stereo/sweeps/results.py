@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from tensor_stereo.configs import SweepConfig
+from tensor_stereo.configs import SweepConfig, TrialConfig
 from tensor_stereo.evaluation.rows import setting_columns
 from tensor_stereo.sweeps.batches import METRICS_SCHEMA
 from tensor_stereo.sweeps.grid import expand_grid
@@ -26,12 +26,19 @@ def read_results(run: Path | str) -> pl.DataFrame:
         FileNotFoundError: if ``run`` is no run folder.
         ValueError: if it has a format that this release does not read.
     """
-    table = scan_parts(run, "metrics", METRICS_SCHEMA).collect().sort("unit", "trial")
-    settings = [setting_columns(trial) for trial in read_config(run).trials]
-    names = settings[0].keys()
-    known = pl.DataFrame(settings, schema={name: METRICS_SCHEMA[name] for name in names})
-    known = known.with_row_index("trial").cast({"trial": METRICS_SCHEMA["trial"]})
-    return table.drop(names).join(known, on="trial", how="left", maintain_order="left").select(list(METRICS_SCHEMA))
+    table = scan_results(run).collect().sort("unit", "trial")
+    return table.join(read_settings(run), on="trial", how="left", maintain_order="left").select(list(METRICS_SCHEMA))
+
+
+def scan_results(run: Path | str) -> pl.LazyFrame:
+    """The rows of :func:`read_results` without their settings, lazily and in any order."""
+    return scan_parts(run, "metrics", METRICS_SCHEMA).drop(setting_columns(TrialConfig()))
+
+
+def read_settings(run: Path | str) -> pl.DataFrame:
+    """One row per point of the grid: ``trial``, its number, and the columns of its settings."""
+    settings = [{"trial": k} | setting_columns(trial) for k, trial in enumerate(read_config(run).trials)]
+    return pl.DataFrame(settings, schema={name: METRICS_SCHEMA[name] for name in settings[0]})
 
 
 def read_config(run: Path | str) -> SweepConfig:

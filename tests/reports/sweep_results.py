@@ -19,6 +19,7 @@ from tensor_stereo.configs import ConsensusConfig, SGBMConfig
 from tensor_stereo.evaluation.metrics import confusion_update, roc_update
 from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES
 from tensor_stereo.reports.sweep.results import ERROR_COLUMNS, Overlay, RunResults
+from tensor_stereo.reports.sweep.rows import RunRows
 
 SCENES = ("Art", "Books", "Cones", "Dolls", "Laundry", "Moebius", "Reindeer", "Teddy")
 _INCORRECT = {"sift": 0.15, "fast": 0.5, "surf": 0.7, "gftt": 0.42}  # about what the detectors give
@@ -172,11 +173,16 @@ def make_errors(num: int = 2) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=dict(zip(ERROR_COLUMNS, kinds, strict=True)), orient="row")
 
 
+def trials_of(results: pl.DataFrame) -> pl.DataFrame:
+    """The sums of each trial."""
+    return RunRows.of(results).trials
+
+
 def make_run(name: str = "baseline", results: pl.DataFrame | None = None, *, num_errors: int = 2) -> RunResults:
     """A run with everything."""
     return RunResults(
         name=name,
-        results=make_results() if results is None else results,
+        rows=RunRows.of(make_results() if results is None else results),
         errors=make_errors(num_errors),
         config={"manifest": "manifest.parquet", "trials": [{"detector": "fast", "score": "topology"}]},
         environment=[

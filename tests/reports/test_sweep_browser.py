@@ -224,7 +224,7 @@ def test_ten_thousand_rows_are_paged(opened: Callable[..., Report], results: pl.
 def test_names_of_scenes_run_nothing(opened: Callable[..., Report], results: pl.DataFrame) -> None:
     hostile = "</script><script>window.broken = 1</script><img src=x onerror='window.broken = 1'>"
     run = make_run(hostile, results.with_columns(scene=pl.lit(hostile)))
-    report = opened(RunResults(run.name, run.results, run.errors.with_columns(message=pl.lit(hostile)), {}, []))
+    report = opened(RunResults(run.name, run.rows, run.errors.with_columns(message=pl.lit(hostile)), {}, []))
     assert report.browser.run("typeof window.broken") == "undefined"
     assert set(report.column("pairs", "scene", report.rows("pairs"))) == {hostile}
     assert report.browser.complaints() == []

@@ -7,11 +7,16 @@ import polars as pl
 import pytest
 
 from tensor_stereo.configs import ConsensusConfig
-from tensor_stereo.reports.sweep.compare import METRICS, NUM_RESAMPLES, SEED, bootstrap_means, compare_runs
-from tensor_stereo.reports.sweep.pooling import setting_text
+from tensor_stereo.reports.sweep.compare import METRICS, NUM_RESAMPLES, SEED, Comparison, bootstrap_means, compare_runs
+from tensor_stereo.reports.sweep.rows import RunRows
+from tensor_stereo.reports.sweep.settings import setting_text
 from tests.reports.sweep_results import consensus_columns, make_grid, make_results
 
 GRID = make_grid(("sift", "fast"), outlier_rates=(0.0, 0.3))
+
+
+def compare(a: pl.DataFrame, b: pl.DataFrame) -> Comparison:
+    return compare_runs(RunRows.of(a), RunRows.of(b))
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +27,7 @@ def runs() -> tuple[pl.DataFrame, pl.DataFrame]:
 
 def test_differences_are_means_over_the_common_pairs(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
     a, b = runs
-    comparison = compare_runs(a, b)
+    comparison = compare(a, b)
     assert comparison.num_common_pairs == 5
     assert comparison.only_pairs == (["middlebury-2005/Moebius"], [])
     assert comparison.trials["trial"].to_list() == list(range(2, len(GRID)))
@@ -40,7 +45,7 @@ def test_differences_are_means_over_the_common_pairs(runs: tuple[pl.DataFrame, p
 
 
 def test_detectors_weigh_every_pair_once(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
-    comparison = compare_runs(*runs)
+    comparison = compare(*runs)
     assert comparison.detectors["detector"].to_list() == ["sift", "fast", "all"]
     assert comparison.detectors["num_settings"].to_list() == [6, 8, 14]
     trials = comparison.trials
@@ -53,7 +58,7 @@ def test_detectors_weigh_every_pair_once(runs: tuple[pl.DataFrame, pl.DataFrame]
 
 
 def test_exchanged_runs_exchange_signs(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
-    forth, back = compare_runs(*runs), compare_runs(*runs[::-1])
+    forth, back = compare(*runs), compare(*runs[::-1])
     trials = back.trials.sort("trial_b")
     for name in METRICS:
         for end, other in (("mean", "mean"), ("low", "high"), ("high", "low")):
@@ -62,7 +67,7 @@ def test_exchanged_runs_exchange_signs(runs: tuple[pl.DataFrame, pl.DataFrame]) 
 
 
 def test_run_equals_itself(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
-    comparison = compare_runs(runs[0], runs[0])
+    comparison = compare(runs[0], runs[0])
     ends = [f"{name}_{end}" for name in METRICS for end in ("mean", "low", "high")]
     assert (comparison.trials.select(ends) == 0).to_numpy().all()
     assert comparison.only.is_empty()
@@ -88,7 +93,7 @@ def test_interval_narrows_with_more_pairs_as_theory_says() -> None:
 
 def test_one_pair_has_a_mean_and_no_interval(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
     a, b = (frame.filter(pl.col("scene") == "Art") for frame in runs)
-    comparison = compare_runs(a, b)
+    comparison = compare(a, b)
     assert comparison.trials["auc_mean"].is_not_nan().all()
     assert comparison.trials["auc_low"].is_nan().all()
     assert comparison.trials["auc_high"].is_nan().all()
@@ -96,17 +101,17 @@ def test_one_pair_has_a_mean_and_no_interval(runs: tuple[pl.DataFrame, pl.DataFr
 
 def test_undefined_rates_are_left_out(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
     a, b = runs
-    known = compare_runs(a.filter(pl.col("scene") != "Art"), b)
+    known = compare(a.filter(pl.col("scene") != "Art"), b)
     undefined = pl.when(pl.col("scene") == "Art").then(math.nan).otherwise("specificity").alias("specificity")
-    without = compare_runs(a.with_columns(undefined), b)
+    without = compare(a.with_columns(undefined), b)
     np.testing.assert_allclose(without.trials["specificity_mean"], known.trials["specificity_mean"], atol=1e-12)
-    no_score = compare_runs(a.with_columns(auc=pl.lit(None, pl.Float64)), b)
+    no_score = compare(a.with_columns(auc=pl.lit(None, pl.Float64)), b)
     assert no_score.trials["auc_mean"].is_nan().all()
 
 
 def test_points_that_agree_in_all_columns_are_paired_in_order() -> None:
     twice = make_results([*GRID[:2], *GRID[:2]], num_pairs=2)
-    comparison = compare_runs(twice, twice)
+    comparison = compare(twice, twice)
     assert comparison.trials["trial_b"].to_list() == comparison.trials["trial"].to_list() == [0, 1, 2, 3]
 
 
@@ -115,7 +120,7 @@ def test_what_the_runs_as_a_whole_differ_in_does_not_part_them() -> None:
     grid = make_grid(("sift", "fast"), scores=("none", "topology"))
     other = [trial | gates | {"feature_backend": "opencv"} for trial in grid if trial["detector"] == "sift"]
     other = [trial | {"temperature": 2.0 if trial["temperature"] else None} for trial in other]
-    comparison = compare_runs(make_results(grid, num_pairs=2), make_results(other, num_pairs=2))
+    comparison = compare(make_results(grid, num_pairs=2), make_results(other, num_pairs=2))
     assert comparison.changed == {
         "feature_backend": ("kornia, –", "opencv"),
         "max_row_offset_px": ("1", "off"),
@@ -125,8 +130,8 @@ def test_what_the_runs_as_a_whole_differ_in_does_not_part_them() -> None:
     assert comparison.trials["trial"].to_list() == comparison.trials["trial_b"].to_list() == list(range(len(other)))
     assert set(comparison.only["detector"]) == {"fast"}
     scores = [make_results(make_grid(("sift",), scores=(score,)), num_pairs=2) for score in ("learned", "none")]
-    assert compare_runs(*scores).changed == {"score": ("learned", "none"), "rectified": ("yes", "–")}
-    assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
+    assert compare(*scores).changed == {"score": ("learned", "none"), "rectified": ("yes", "–")}
+    assert len(compare(*scores).trials) == scores[0]["trial"].n_unique()
 
 
 def test_runs_of_two_scores_differ_in_the_settings_of_both() -> None:
@@ -136,13 +141,13 @@ def test_runs_of_two_scores_differ_in_the_settings_of_both() -> None:
     assert len(own) == 9
     changed = {"score": names, "rectified": ("–", "yes")}
     changed |= {"temperature": ("1", "–"), "temperature_unit": ("edge", "–")} | own
-    assert compare_runs(*scores).changed == changed
-    assert len(compare_runs(*scores).trials) == scores[0]["trial"].n_unique()
+    assert compare(*scores).changed == changed
+    assert len(compare(*scores).trials) == scores[0]["trial"].n_unique()
 
 
 def test_the_same_points_decided_in_another_way_are_paired() -> None:
     runs = [make_grid(("sift", "fast"), verdicts=(name,), scores=("learned",)) for name in ("cardinality", "score")]
-    comparison = compare_runs(*(make_results(grid, num_pairs=3) for grid in runs))
+    comparison = compare(*(make_results(grid, num_pairs=3) for grid in runs))
     assert comparison.changed == {"verdict": ("cardinality", "score")}
     assert comparison.trials["trial"].to_list() == comparison.trials["trial_b"].to_list() == list(range(len(runs[0])))
     assert comparison.only.is_empty()
@@ -155,8 +160,8 @@ def test_a_setting_of_consensus_parts_points_only_where_both_runs_have_several_v
         grid = make_grid(("fast",), outlier_rates=(0.0,), scores=("consensus",), slopes=slopes)
         return make_results(grid, num_pairs=2)
 
-    assert compare_runs(run(0.1), run(0.3)).changed == {"consensus_slope": ("0.1", "0.3")}
-    both = compare_runs(run(0.1, 0.3), run(0.3, 0.5))
+    assert compare(run(0.1), run(0.3)).changed == {"consensus_slope": ("0.1", "0.3")}
+    both = compare(run(0.1, 0.3), run(0.3, 0.5))
     assert both.changed == {}
     assert both.trials["consensus_slope"].to_list() == [0.3] * 4
     assert sorted(both.only.select("run", "consensus_slope").unique().rows()) == [("A", 0.1), ("B", 0.5)]
@@ -166,7 +171,7 @@ def test_runs_without_common_settings_have_no_differences() -> None:
     a = make_results(make_grid(("sift",)), num_pairs=2)
     b = make_results(make_grid(("fast",)), num_pairs=2)
     for other, num_pairs in ((b, 2), (b.clear(), 0)):
-        comparison = compare_runs(a, other)
+        comparison = compare(a, other)
         assert comparison.trials.is_empty()
         assert comparison.detectors.is_empty()
         assert comparison.num_common_pairs == num_pairs

@@ -10,13 +10,14 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tensor_stereo.evaluation.rows import STAGES
 from tensor_stereo.reports.sweep.curve_figures import curve_figures
 from tensor_stereo.reports.sweep.curves import detector_curves
 from tensor_stereo.reports.sweep.drawing import MAX_SERIES, PAPER_CLAIM
 from tensor_stereo.reports.sweep.figures import perturbation_figures, runtime_figure, scatter_figure
 from tensor_stereo.reports.sweep.pooling import pool_trials, stage_times
 from tensor_stereo.reports.sweep.svg import NUM_COLORS, Axis, Key, Plot, legend, log_axis, name_axis, rate_axis
-from tests.reports.sweep_results import make_grid, make_results, make_run
+from tests.reports.sweep_results import make_grid, make_results, make_run, trials_of
 
 GRID = make_grid(("sift", "fast"), outlier_rates=(0.0, 0.2, 0.4))
 Points = list[tuple[float, float]]
@@ -78,7 +79,7 @@ def defined(xs: np.ndarray, ys: np.ndarray) -> Points:
 
 
 def test_curves_and_verdicts_lie_where_the_counts_say(results: pl.DataFrame) -> None:
-    found = detector_curves(results)
+    found = detector_curves(trials_of(results))
     drawn = plots(curve_figures([make_run("run", results)]))
     assert [plot.title for plot in drawn] == [
         f"{name}: {kind}" for name in ("SIFT", "FAST") for kind in ("ROC", "precision-recall")
@@ -124,7 +125,7 @@ def test_marks_tell_how_each_verdict_was_reached() -> None:
     assert all(len(found) == 1 for found in shapes.values())
     assert len(set.union(*shapes.values())) == 3
     lines = [roc.values(points) for names, points, _ in roc.paths("line") if "chance" not in names]
-    for row in pool_trials(results).filter(verdict="score").iter_rows(named=True):
+    for row in pool_trials(trials_of(results)).filter(verdict="score").iter_rows(named=True):
         point = (1 - row["specificity"], row["sensitivity"])
         assert min(off([point], line) for line in lines) < 2e-3
 
@@ -152,7 +153,7 @@ def test_many_scores_show_the_best_and_say_so() -> None:
     scores = [f"score-{k}" for k in range(MAX_SERIES + 2)]
     results = make_results(make_grid(("fast",), outlier_rates=(0.0,), scores=scores), num_pairs=2)
     html = curve_figures([make_run("run", results)])
-    (item,) = detector_curves(results)
+    (item,) = detector_curves(trials_of(results))
     assert len(item.curves) == 2 * (MAX_SERIES + 2)
     assert f"The {MAX_SERIES} curves with the largest area of {len(item.curves)}." in html
     areas = [float(text.rpartition("AUC ")[2]) for text in legend_texts(html) if "AUC" in text]
@@ -162,7 +163,7 @@ def test_many_scores_show_the_best_and_say_so() -> None:
 def test_scatter_has_every_trial_and_the_claim_of_the_paper(results: pl.DataFrame) -> None:
     html = scatter_figure([make_run("run", results)])
     (plot,) = plots(html)
-    pooled = pool_trials(results)
+    pooled = pool_trials(trials_of(results))
     *marks, star = plot.paths("mark")
     assert off(plot.values(star[1]), [(0.96, 0.70)]) < 1e-3
     assert star[2] == PAPER_CLAIM
@@ -176,7 +177,7 @@ def test_scatter_has_every_trial_and_the_claim_of_the_paper(results: pl.DataFram
 
 def test_run_times_lie_on_a_logarithmic_axis(results: pl.DataFrame) -> None:
     (plot,) = plots(runtime_figure([make_run("run", results)]))
-    times = stage_times(results)
+    times = stage_times(trials_of(results))
     stages = [text for text, _ in plot.y_ticks]
     assert stages == times.columns[1:]
     ((low, left), *_, (high, right)) = [(math.log10(float(text or "")), at) for text, at in plot.x_ticks]
@@ -186,14 +187,14 @@ def test_run_times_lie_on_a_logarithmic_axis(results: pl.DataFrame) -> None:
     for (stage, value), (_, ((x, y),), _) in zip(expected, marks, strict=True):
         assert low + (x - left) / (right - left) * (high - low) == pytest.approx(math.log10(value), abs=3e-3)
         assert min(plot.y_ticks, key=lambda tick: abs(tick[1] - y))[0] == stage
-    never = results.with_columns(pl.struct(pl.lit(0.0).alias("detect")).alias("seconds"))
+    never = results.with_columns(pl.struct(pl.lit(0.0).alias(name) for name in STAGES).alias("seconds"))
     assert runtime_figure([make_run("run", never)]) == ""
 
 
 def test_rates_follow_the_outliers(results: pl.DataFrame) -> None:
     drawn = plots(perturbation_figures([make_run("run", results)], "outlier_rate"))
     assert len(drawn) == 2 * 4
-    pooled = pool_trials(results)
+    pooled = pool_trials(trials_of(results))
     for plot in drawn:
         assert [text for text, _ in plot.x_ticks] == ["0", "0.2", "0.4"]
         detector, _, heading = (plot.title or "").partition(": ")

@@ -12,21 +12,16 @@ from tensor_stereo.configs import TrialConfig
 from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES, setting_columns
 from tensor_stereo.reports.sweep.curves import detector_curves
 from tensor_stereo.reports.sweep.pooling import (
-    CELLS,
-    SCORE_RATES,
-    SETTINGS,
-    VERDICT_RATES,
     best_trials,
     decided_by_score,
     mildest,
-    order_detectors,
     pool_trials,
-    settings_label,
     stage_times,
-    varying_settings,
     worst_pairs,
 )
-from tests.reports.sweep_results import make_grid, make_results
+from tensor_stereo.reports.sweep.rows import CELLS, SCORE_RATES, SECONDS_UNIT, VERDICT_RATES, RunRows
+from tensor_stereo.reports.sweep.settings import SETTINGS, order_detectors, settings_label, varying_settings
+from tests.reports.sweep_results import make_grid, make_results, trials_of
 
 SMALL = make_grid(("fast", "sift"), outlier_rates=(0.0, 0.3), scores=("none", "topology"))
 
@@ -45,7 +40,7 @@ def samples(rows: pl.DataFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_rates_of_a_trial_are_those_of_all_its_matches(results: pl.DataFrame) -> None:
-    pooled = pool_trials(results)
+    pooled = pool_trials(trials_of(results))
     assert pooled["trial"].to_list() == list(range(len(SMALL)))
     for row in pooled.iter_rows(named=True):
         rows = results.filter(pl.col("trial") == row["trial"])
@@ -58,11 +53,11 @@ def test_rates_of_a_trial_are_those_of_all_its_matches(results: pl.DataFrame) ->
         assert {name: row[name] for name in SETTINGS} == SMALL[row["trial"]]
         assert row["mean_npv"] == pytest.approx(np.mean(rows["npv"].to_list()), rel=1e-12)
         totals = [sum(stages.values()) for stages in rows["seconds"]]
-        assert row["seconds"] == pytest.approx(np.mean(totals), rel=1e-12)
+        assert row["seconds"] == pytest.approx(np.mean(totals), abs=SECONDS_UNIT)  # to which each row is rounded
 
 
 def test_auc_and_specificity_are_those_of_every_pair_of_matches(results: pl.DataFrame) -> None:
-    for row in pool_trials(results).iter_rows(named=True):
+    for row in pool_trials(trials_of(results)).iter_rows(named=True):
         if row["score"] == "none":
             assert row["auc"] is row["mean_auc"] is row["specificity_at_sensitivity_96"] is None
             assert row["score_counts_correct"] is None
@@ -76,17 +71,20 @@ def test_auc_and_specificity_are_those_of_every_pair_of_matches(results: pl.Data
 
 def test_seeds_are_pooled_on_request() -> None:
     seeds = make_results(make_grid(("fast",), outlier_rates=(0.2,), seeds=(3, 4)), num_pairs=2)
-    pooled = pool_trials(seeds, over=("seed",))
+    pooled = pool_trials(trials_of(seeds), over=("seed",))
     assert "seed" not in pooled.columns
     assert pooled["trial"].to_list() == [0, 2, 4, 6]
     assert pooled["num_pairs"].to_list() == [2] * 4
-    assert pooled["num_matches"].to_list() == pool_trials(seeds)["num_matches"].reshape((4, 2)).arr.sum().to_list()
+    assert (
+        pooled["num_matches"].to_list()
+        == pool_trials(trials_of(seeds))["num_matches"].reshape((4, 2)).arr.sum().to_list()
+    )
 
 
 def test_trials_that_differ_in_no_column_stay_apart() -> None:
     grid = make_grid(("fast",), outlier_rates=(0.0,))
     twice = make_results([*grid, *grid], num_pairs=2)
-    assert len(pool_trials(twice)) == len(pool_trials(twice, over=("seed",))) == 2 * len(grid)
+    assert len(pool_trials(trials_of(twice))) == len(pool_trials(trials_of(twice), over=("seed",))) == 2 * len(grid)
 
 
 def test_undefined_rates_leave_the_mean_and_stay_undefined(results: pl.DataFrame) -> None:
@@ -95,30 +93,35 @@ def test_undefined_rates_leave_the_mean_and_stay_undefined(results: pl.DataFrame
     some = results.with_columns(
         pl.when(where).then(value).otherwise(name).alias(name) for name, value in nothing.items()
     )
-    others = pool_trials(results.filter(~where))
-    assert pool_trials(some)["mean_ppv"].to_list() == others["mean_ppv"].to_list()
-    none = pool_trials(results.with_columns(**nothing))
+    others = pool_trials(trials_of(results.filter(~where)))
+    assert pool_trials(trials_of(some))["mean_ppv"].to_list() == others["mean_ppv"].to_list()
+    none = pool_trials(trials_of(results.with_columns(**nothing)))
     assert none["sensitivity"].is_nan().all()
     assert none["mean_sensitivity"].is_null().all()
 
 
 def test_what_varies_tells_trials_apart_and_does_not_follow_from_the_detector() -> None:
     frames = [make_results(make_grid(("fast", "sift")), num_pairs=1), make_results(make_grid(("surf",)), num_pairs=1)]
-    assert varying_settings(frames) == ["detector", "variant", "verdict", "outlier_rate"]
+    assert varying_settings([trials_of(each) for each in frames]) == ["detector", "variant", "verdict", "outlier_rate"]
     windows = [
         make_results([trial | {"window_px": size} for trial in make_grid(("fast",))], num_pairs=1) for size in (7, 9)
     ]
-    assert varying_settings(windows) == ["window_px", "variant", "verdict", "outlier_rate"]
-    assert varying_settings([frames[0].clear()]) == []
+    assert varying_settings([trials_of(each) for each in windows]) == [
+        "window_px",
+        "variant",
+        "verdict",
+        "outlier_rate",
+    ]
+    assert varying_settings([trials_of(frames[0].clear())]) == []
 
 
 def test_settings_of_consensus_tell_trials_apart_where_they_do_not_follow_from_the_score() -> None:
     one_slope = make_grid(("fast",), outlier_rates=(0.0,), scores=("none", "learned", "topology", "consensus"))
-    assert varying_settings([make_results(one_slope, num_pairs=1)]) == ["variant", "verdict", "score"]
+    assert varying_settings([trials_of(make_results(one_slope, num_pairs=1))]) == ["variant", "verdict", "score"]
     slopes = make_grid(("fast",), outlier_rates=(0.0,), scores=("learned", "consensus"), slopes=(0.1, 0.3))
     results = make_results(slopes, num_pairs=1)
-    assert varying_settings([results]) == ["variant", "verdict", "score", "consensus_slope"]
-    pooled = pool_trials(results)
+    assert varying_settings([trials_of(results)]) == ["variant", "verdict", "score", "consensus_slope"]
+    pooled = pool_trials(trials_of(results))
     assert len(pooled) == len(slopes) == 2 * 2 * 3
     assert pooled["consensus_slope"].to_list() == [row["consensus_slope"] for row in slopes]
     labels = [settings_label(row, ["score", "consensus_slope"]) for row in pooled[:3].iter_rows(named=True)]
@@ -143,7 +146,7 @@ def test_labels_name_words_and_numbers() -> None:
 def test_mildest_perturbation_is_found_per_detector() -> None:
     sift, fast = make_grid(("sift",), outlier_rates=(0.2, 0.4)), make_grid(("fast",), outlier_rates=(0.0, 0.4))
     noisy = [trial | {"noise_px": 0.5 if trial["outlier_rate"] == 0.2 else 0.0} for trial in sift]
-    found = mildest(make_results([*noisy, *fast], num_pairs=1))
+    found = mildest(trials_of(make_results([*noisy, *fast], num_pairs=1)))
     assert set(found.select("detector", "outlier_rate", "noise_px").rows()) == {("sift", 0.2, 0.5), ("fast", 0.0, 0.0)}
 
 
@@ -152,37 +155,38 @@ def test_worst_pairs_are_bad_at_their_best_trial(results: pl.DataFrame) -> None:
     for row in results.filter(pl.col("outlier_rate") == 0).iter_rows(named=True):
         key = row["detector"], row["scene"]
         best[key] = max(best.get(key, 0.0), (row["sensitivity"] + row["specificity"]) / 2)
-    worst = worst_pairs(results, 2)
+    worst = worst_pairs(RunRows.of(results), 2)
     expected = [sorted((best[d, s], d, s) for name, s in best if name == d)[:2] for d in ("sift", "fast")]
     rows = list(worst.select("balanced_accuracy", "detector", "scene").iter_rows())
     assert rows == [*expected[0], *expected[1]]
     none = pl.lit(0, pl.Int64)
     undefined = results.with_columns(specificity=pl.lit(math.nan), false_positive=none, true_negative=none)
-    assert worst_pairs(undefined).is_empty()
-    assert best_trials(undefined).is_empty()
+    assert worst_pairs(RunRows.of(undefined)).is_empty()
+    assert best_trials(trials_of(undefined)).is_empty()
 
 
 def test_best_trial_of_each_detector_has_the_highest_mean(results: pl.DataFrame) -> None:
-    pooled = pool_trials(results.filter(pl.col("outlier_rate") == 0))
-    for row in best_trials(results).iter_rows(named=True):
+    pooled = pool_trials(trials_of(results.filter(pl.col("outlier_rate") == 0)))
+    for row in best_trials(trials_of(results)).iter_rows(named=True):
         rivals = pooled.filter(pl.col("detector") == row["detector"])
         assert row["sensitivity"] + row["specificity"] == (rivals["sensitivity"] + rivals["specificity"]).max()
         assert row["score"] == "topology"  # equal without a score
 
 
 def test_stage_times_are_means_over_the_rows_in_which_a_stage_ran(results: pl.DataFrame) -> None:
-    times = stage_times(results)
+    times = stage_times(trials_of(results))
     assert times.columns == ["detector", *STAGES[:-1], "total"]  # nothing was repaired or refined
     assert times["detector"].to_list() == ["sift", "fast"]
     for (k, detector), stage in product(enumerate(times["detector"]), STAGES[:-1]):
         spent = [row[stage] for row in results.filter(pl.col("detector") == detector)["seconds"]]
-        assert times[stage][k] == pytest.approx(1000 * np.mean([value for value in spent if value > 0]), rel=1e-12)
+        mean = np.mean([value for value in spent if value > 0])
+        assert times[stage][k] == pytest.approx(1000 * mean, abs=1000 * SECONDS_UNIT)
     plain = results.filter(pl.col("variant") == "unconstrained")
-    assert "group" not in stage_times(plain).columns
+    assert "group" not in stage_times(trials_of(plain)).columns
 
 
 def test_curves_hold_every_threshold_and_the_trials_that_share_them(results: pl.DataFrame) -> None:
-    found = detector_curves(results)
+    found = detector_curves(trials_of(results))
     assert [item.detector for item in found] == ["sift", "fast"]
     for item in found:
         assert len(item.curves) == 2  # with and without objects
@@ -205,7 +209,7 @@ def test_curves_hold_every_threshold_and_the_trials_that_share_them(results: pl.
 
 def test_a_verdict_by_score_is_a_point_of_the_curve_that_it_shares_with_the_others() -> None:
     grid = make_grid(("fast",), verdicts=("score", "adjacency", "cardinality"), scores=("consensus", "learned"))
-    (found,) = detector_curves(make_results(grid, num_pairs=3))
+    (found,) = detector_curves(trials_of(make_results(grid, num_pairs=3)))
     assert len(found.curves) == 2 * 2  # of two scores, with and without objects
     assert found.verdicts == ()
     for curve in found.curves:
@@ -220,18 +224,18 @@ def test_a_verdict_by_score_is_a_point_of_the_curve_that_it_shares_with_the_othe
 
 def test_score_without_incorrect_matches_has_no_curve(results: pl.DataFrame) -> None:
     none = results["score_counts_incorrect"].list.eval(pl.element() * 0)
-    (first, *_) = detector_curves(results.with_columns(score_counts_incorrect=none))
+    (first, *_) = detector_curves(trials_of(results.with_columns(score_counts_incorrect=none)))
     assert first.curves == ()
     assert len(first.verdicts) == 8
 
 
 def test_empty_results_pool_to_nothing(results: pl.DataFrame) -> None:
     empty = results.clear()
-    pooled = pool_trials(empty)
+    pooled = pool_trials(trials_of(empty))
     assert pooled.is_empty()
     assert set(SCORE_RATES + VERDICT_RATES) <= set(pooled.columns)
-    assert detector_curves(empty) == []
-    assert stage_times(empty).is_empty()
+    assert detector_curves(trials_of(empty)) == []
+    assert stage_times(trials_of(empty)).is_empty()
 
 
 def test_detectors_come_in_the_order_of_the_paper() -> None:
@@ -248,16 +252,16 @@ def test_rectified_tells_trials_apart() -> None:
     grid = make_grid(("fast",), verdicts=("score",), scores=("learned", "none"), outlier_rates=(0.0,), rectified=kinds)
     grid = [point for point in grid if point["score"] == "learned" and point["variant"] == "unconstrained"]
     results = make_results(grid, num_pairs=2)
-    assert varying_settings([results]) == ["rectified"]
-    assert pool_trials(results)["rectified"].to_list() == list(kinds)
+    assert varying_settings([trials_of(results)]) == ["rectified"]
+    assert pool_trials(trials_of(results))["rectified"].to_list() == list(kinds)
     rows = results.unique("trial", maintain_order=True).rows(named=True)
     labels = [settings_label(row, ["score", "rectified"]) for row in rows]
     assert labels == ["learned, rectified yes", "learned, rectified no", "learned, rectified auto"]
-    (curve,) = detector_curves(results)[0].curves  # the made-up scores are those of one draw
+    (curve,) = detector_curves(trials_of(results))[0].curves  # the made-up scores are those of one draw
     assert [row["rectified"] for row in curve.trials] == list(kinds)
     assert "rectified" not in curve.fixed_settings()
 
 
 def test_rectified_follows_from_a_score_that_does_not_ask() -> None:
     results = make_results(make_grid(("fast",), scores=("learned", "topology"), outlier_rates=(0.0,)), num_pairs=1)
-    assert "rectified" not in varying_settings([results])
+    assert "rectified" not in varying_settings([trials_of(results)])

@@ -20,9 +20,10 @@ from tensor_stereo.reports.sweep.data_tables import Column, script_json
 from tensor_stereo.reports.sweep.overlays import draw_overlay
 from tensor_stereo.reports.sweep.pooling import pool_trials
 from tensor_stereo.reports.sweep.report import write_report
-from tensor_stereo.reports.sweep.results import ERROR_COLUMNS, RESULT_COLUMNS, Overlay, RunResults
+from tensor_stereo.reports.sweep.results import ERROR_COLUMNS, Overlay, RunResults
+from tensor_stereo.reports.sweep.rows import RESULT_COLUMNS, RunRows
 from tensor_stereo.types import Matches, StereoPair
-from tests.reports.sweep_results import make_errors, make_grid, make_png, make_results, make_run
+from tests.reports.sweep_results import make_errors, make_grid, make_png, make_results, make_run, trials_of
 
 HOSTILE = "</script><script>window.broken = 1</script><img src=x onerror='window.broken = 1'>\u2028&amp;"
 GRID = make_grid(("sift", "fast"))
@@ -97,7 +98,7 @@ def test_page_is_one_file_that_allows_itself_alone(results: pl.DataFrame, tmp_pa
 def test_page_of_2000_rows_stays_below_2_mb(tmp_path: Path) -> None:
     grid = make_grid(outlier_rates=(0.0, 0.1, 0.2, 0.4), scores=("none", "topology"))
     run = make_run("run", make_results(grid, num_pairs=16))
-    assert len(run.results) >= 2000
+    assert len(run.rows) >= 2000
     (page, _) = write_report([replace(run, overlays=())], tmp_path)
     assert page.stat().st_size < 2e6
 
@@ -113,7 +114,7 @@ def test_tables_of_the_page_hold_every_row(results: pl.DataFrame, tmp_path: Path
     assert shown["sens."] == pytest.approx(results["sensitivity"].to_list(), abs=6e-5)
     assert shown["AUC"] == pytest.approx(results["auc"].to_list(), abs=6e-5)
     assert "window px" not in headings  # follows from the detector
-    pooled = pool_trials(results)
+    pooled = pool_trials(trials_of(results))
     trials = cells(tables["trials"])
     groups = [(column["group"], column["heading"]) for column in tables["trials"]["columns"]]
     for group, prefix in (("pairs pooled", ""), ("mean over pairs", "mean_")):
@@ -145,13 +146,15 @@ def test_nothing_in_the_data_becomes_markup(results: pl.DataFrame, tmp_path: Pat
     evil = pl.lit(HOSTILE).alias
     run = RunResults(
         name=HOSTILE,
-        results=results.with_columns(evil("scene"), evil("dataset"), evil("score"), host=pl.col("host") + HOSTILE),
+        rows=RunRows.of(
+            results.with_columns(evil("scene"), evil("dataset"), evil("score"), host=pl.col("host") + HOSTILE)
+        ),
         errors=make_errors().with_columns(evil("scene"), evil("message"), evil("stage"), evil("error")),
         config={HOSTILE: HOSTILE},
         environment=[{HOSTILE: HOSTILE}],
         overlays=(Overlay(HOSTILE, make_png()),),
     )
-    other = replace(run, results=run.results.with_columns(scene=pl.lit("one more")))
+    other = replace(run, rows=RunRows.of(results.with_columns(scene=pl.lit("one more"))))
     for runs in ([run], [run, run], [run, other]):
         page, markdown = render(runs, tmp_path)
         assert len(page.all("script")) == 2
@@ -213,12 +216,13 @@ def test_markdown_has_summary_and_pooled_tables(results: pl.DataFrame, tmp_path:
         "trials, mean over the pairs",
         "Run-time in ms per pair, mean over the trials in which a stage ran",
         "pairs on which even the best trial does badly",
+        "failed units by error",
         "failed units",
         "environment",
     ]
     pooled = markdown.split("trials, pairs pooled**\n\n")[1].split("\n\n")[0].splitlines()
     assert len(pooled) == 2 + len(GRID)
-    row = pool_trials(results).row(0, named=True)
+    row = pool_trials(trials_of(results)).row(0, named=True)
     assert f"| {row['sensitivity']:.3f} | {row['specificity']:.3f} |" in re.sub(" +", " ", pooled[2])
 
 
@@ -253,8 +257,10 @@ def test_run_without_ground_truth_has_a_report(tmp_path: Path, results: pl.DataF
 
 
 def test_equal_runs_give_equal_files(results: pl.DataFrame, tmp_path: Path) -> None:
-    first, second = (write_report([make_run("run", results)], tmp_path / name) for name in ("a", "b"))
-    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    shuffled = results.sample(fraction=1, shuffle=True, seed=0)  # as parts of other shards would lie
+    reports = [write_report([make_run("run", rows)], tmp_path / f"{k}") for k, rows in enumerate((results, shuffled))]
+    first, second = ([path.read_bytes() for path in paths] for paths in reports)
+    assert first == second
 
 
 def test_hosts_whose_times_are_mixed_are_named(results: pl.DataFrame, tmp_path: Path) -> None:
@@ -287,14 +293,14 @@ def test_wrong_input_is_named(results: pl.DataFrame, tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="runs must hold one or two runs, got"):
             write_report(runs, tmp_path)
     with pytest.raises(ValueError, match="results must have the columns auc, host, got unit, "):
-        replace(run, results=results.drop("auc", "host"))
+        RunRows.of(results.drop("auc", "host"))
     with pytest.raises(ValueError, match="errors must have the columns message, got unit, "):
         replace(run, errors=run.errors.drop("message"))
     with pytest.raises(ValueError, match="one row per unit and trial, got unit 0, trial 0 twice"):
-        replace(run, results=pl.concat([results, results.head(1)]))
+        RunRows.of(pl.concat([results, results.head(1)]))
     short = results.with_columns(pl.col("score_counts_correct").list.head(5))
     with pytest.raises(ValueError, match="128 bins in score_counts_correct, got 5"):
-        replace(run, results=short)
+        RunRows.of(short)
     with pytest.raises(ValueError, match="png of 'Art' must be a PNG file, got b'GIF89a'"):
         Overlay("Art", b"GIF89a")
     (tmp_path / "file").write_text("")

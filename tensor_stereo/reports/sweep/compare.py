@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tensor_stereo.reports.sweep.pooling import SETTINGS, order_detectors, setting_text, with_repeat
+from tensor_stereo.reports.sweep.pooling import with_repeat
+from tensor_stereo.reports.sweep.rows import RunRows, pair_key
+from tensor_stereo.reports.sweep.settings import SETTINGS, order_detectors, setting_text
 
 METRICS = {
     "sensitivity": "sensitivity",
@@ -23,6 +25,7 @@ NUM_RESAMPLES = 2000
 SEED = 0
 LEVEL = 0.95
 _PAIR = ("dataset", "scene")
+_WEIGHTS_AT_ONCE = 1 << 24  # of pairs in resamples
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,7 @@ class Comparison:
     only_pairs: tuple[list[str], list[str]]
 
 
-def compare_runs(results_a: pl.DataFrame, results_b: pl.DataFrame) -> Comparison:
+def compare_runs(a: RunRows, b: RunRows) -> Comparison:
     """Pair the rows of two runs by settings and pair of images.
 
     A setting that has one value in run A and another one in run B, be it per detector or score, is what the runs are
@@ -59,37 +62,46 @@ def compare_runs(results_a: pl.DataFrame, results_b: pl.DataFrame) -> Comparison
     Intervals are percentiles (95 %) of the mean over pairs drawn with replacement, 2000 times from seed 0; all points
     see the same draws. They say how far the mean depends on which pairs there are, nothing about other data sets.
     """
-    changed = _changed_settings(results_a, results_b)
+    changed = _changed_settings(a.trials, b.trials)
     keys = [*(name for name in SETTINGS if name not in changed), "repeat"]
-    points_a, points_b = _points(results_a, keys), _points(results_b, keys)
-    partner = {row["trial"]: points_b[key]["trial"] for key, row in points_a.items() if key in points_b}
-    rows_a = results_a.filter(pl.col("trial").is_in(list(partner)))
-    rows_a = rows_a.with_columns(pl.Series("trial_b", [partner[trial] for trial in rows_a["trial"]], pl.Int32))
-    both = rows_a.join(results_b, left_on=[*_PAIR, "trial_b"], right_on=[*_PAIR, "trial"], suffix="_b")
-    differences = both.select(
-        "trial", "detector", *_PAIR, *((pl.col(f"{name}_b") - pl.col(name)).alias(name) for name in METRICS)
-    ).sort("trial", *_PAIR)
-    trials = _summarise(differences, "trial")
-    settings = [row | {"trial_b": partner[row["trial"]]} for row in points_a.values() if row["trial"] in partner]
-    detectors = order_detectors(differences["detector"].unique())
-    parts = [differences.filter(pl.col("detector") == name) for name in detectors]
-    if len(parts) > 1:
-        parts.append(differences.with_columns(detector=pl.lit("all")))
+    points_a, points_b = _points(a.trials, keys), _points(b.trials, keys)
+    both = [(row, points_b[key]["trial"]) for key, row in points_a.items() if key in points_b]
+    names_a, names_b = _pair_names(a), _pair_names(b)
+    common = names_a.join(names_b.select("pair"), on="pair", how="semi").sort(_PAIR)["pair"]
+    values = [_metrics(rows, common, trials) for rows, trials in (
+        (a, [row["trial"] for row, _ in both]), (b, [trial for _, trial in both])
+    )]  # fmt: skip
+    there = values[0][1] & values[1][1]
+    differences = np.where(there, values[1][0] - values[0][0], np.nan)
+    compared = [k for k in range(len(both)) if there[:, k].any()]
+    trials = [
+        both[k][0] | {"trial_b": both[k][1]} | _summarise(differences[:, :, [k]], there[:, [k]]) for k in compared
+    ]
+    of_detector = {
+        name: [k for k in compared if both[k][0]["detector"] == name]
+        for name in order_detectors({both[k][0]["detector"] for k in compared})
+    }
+    if len(of_detector) > 1:
+        of_detector["all"] = compared
+    detectors = [
+        {"detector": name} | _summarise(differences[:, :, of], there[:, of]) | {"num_settings": len(of)}
+        for name, of in of_detector.items()
+    ]
     only = [
         {"run": run} | row
         for run, points, others in (("A", points_a, points_b), ("B", points_b, points_a))
         for key, row in points.items()
         if key not in others
     ]
-    names = [{"/".join(row) for row in frame.select(*_PAIR).unique().iter_rows()} for frame in (results_a, results_b)]
-    schema: dict[str, Any] = {name: results_a.schema[name] for name in ("trial", *SETTINGS)}
+    schema: dict[str, Any] = {name: a.trials.schema[name] for name in ("trial", *SETTINGS)}
+    ends = {"num_pairs": pl.Int64} | {f"{name}_{end}": pl.Float64 for name in METRICS for end in ENDS}
     return Comparison(
-        changed={name: (_values(results_a, name), _values(results_b, name)) for name in changed},
-        trials=pl.DataFrame(settings, schema=schema | {"trial_b": pl.Int32}).join(trials, on="trial").sort("trial"),
-        detectors=pl.concat([_of_detector(part) for part in parts or [differences]]),
+        changed={name: (_values(a.trials, name), _values(b.trials, name)) for name in changed},
+        trials=pl.DataFrame(trials, schema=schema | {"trial_b": pl.Int32} | ends).sort("trial"),
+        detectors=pl.DataFrame(detectors, schema={"detector": pl.String} | ends | {"num_settings": pl.Int64}),
         only=pl.DataFrame(only, schema={"run": pl.String} | schema),
-        num_common_pairs=len(names[0] & names[1]),
-        only_pairs=(sorted(names[0] - names[1]), sorted(names[1] - names[0])),
+        num_common_pairs=len(common),
+        only_pairs=(_only(names_a, names_b), _only(names_b, names_a)),
     )
 
 
@@ -117,69 +129,89 @@ def bootstrap_means(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], .
     low, high = np.full((2, num_values), np.nan)
     enough = np.flatnonzero(count > 1)
     if len(enough):
-        draws = np.random.default_rng(SEED).integers(0, num_pairs, (NUM_RESAMPLES, num_pairs))
-        weight = np.zeros((NUM_RESAMPLES, num_pairs))
-        np.add.at(weight, (np.arange(NUM_RESAMPLES)[:, None], draws), 1)
-        drawn = weight @ known[:, enough]
-        means = np.divide(weight @ filled[:, enough], drawn, out=np.full_like(drawn, np.nan), where=drawn > 0)
-        low[enough], high[enough] = np.nanquantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+        rng, means = np.random.default_rng(SEED), []
+        at_once = max(1, _WEIGHTS_AT_ONCE // num_pairs)
+        for first in range(0, NUM_RESAMPLES, at_once):
+            draws = rng.integers(0, num_pairs, (min(at_once, NUM_RESAMPLES - first), num_pairs))
+            weight = np.stack([np.bincount(draw, minlength=num_pairs) for draw in draws]).astype(np.float64)
+            drawn = weight @ known[:, enough]
+            means.append(np.divide(weight @ filled[:, enough], drawn, out=np.full_like(drawn, np.nan), where=drawn > 0))
+        low[enough], high[enough] = np.nanquantile(np.concatenate(means), [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
     return mean, low, high
 
 
-def _changed_settings(results_a: pl.DataFrame, results_b: pl.DataFrame) -> list[str]:
+def _changed_settings(trials_a: pl.DataFrame, trials_b: pl.DataFrame) -> list[str]:
     """Settings that follow from the detector, or detector and score, in both runs, but not in the same way."""
     changed = []
     for name in SETTINGS:
         for parents in (("detector",), ("detector", "score")):
             if name not in parents:
-                a, b = _follows(results_a, parents, name), _follows(results_b, parents, name)
+                a, b = _follows(trials_a, parents, name), _follows(trials_b, parents, name)
                 if a is not None and b is not None:
                     changed += [name] if any(a[key] != b[key] for key in a.keys() & b.keys()) else []
                     break
     return changed
 
 
-def _follows(results: pl.DataFrame, parents: Sequence[str], name: str) -> dict[tuple[Any, ...], Any] | None:
+def _follows(trials: pl.DataFrame, parents: Sequence[str], name: str) -> dict[tuple[Any, ...], Any] | None:
     """The value of a setting for each value of its parents; None if some have several."""
-    rows = results.select(*parents, name).unique().rows()
+    rows = trials.select(*parents, name).unique().rows()
     values = {row[:-1]: row[-1] for row in rows}
     return values if len(values) == len(rows) else None
 
 
-def _values(results: pl.DataFrame, name: str) -> str:
-    return ", ".join(setting_text(name, value) for value in results[name].unique().sort(nulls_last=True))
+def _values(trials: pl.DataFrame, name: str) -> str:
+    return ", ".join(setting_text(name, value) for value in trials[name].unique().sort(nulls_last=True))
 
 
-def _points(results: pl.DataFrame, keys: Sequence[str]) -> dict[tuple[Any, ...], dict[str, Any]]:
+def _points(trials: pl.DataFrame, keys: Sequence[str]) -> dict[tuple[Any, ...], dict[str, Any]]:
     """Trial and settings of each point, by some of them and its number among those that agree in all."""
-    points = with_repeat(results).select("trial", *SETTINGS, "repeat").unique().sort("trial")
+    points = with_repeat(trials).select("trial", *SETTINGS, "repeat").sort("trial")
     return {tuple(row[name] for name in keys): row for row in points.iter_rows(named=True)}
 
 
-def _of_detector(differences: pl.DataFrame) -> pl.DataFrame:
-    """One row: every pair's mean over its settings, then over the pairs."""
-    averaged = differences.group_by("detector", *_PAIR, maintain_order=True).agg(
-        pl.col(list(METRICS)).fill_nan(None).mean()
+def _pair_names(rows: RunRows) -> pl.DataFrame:
+    """``pair`` and the names of each pair."""
+    return rows.lazy.select(pair_key().alias("pair"), *_PAIR).unique("pair").collect(engine="streaming")
+
+
+def _only(names: pl.DataFrame, others: pl.DataFrame) -> list[str]:
+    """The names of the pairs that the others lack."""
+    rows = names.join(others.select("pair"), on="pair", how="anti").select(_PAIR).rows()
+    return sorted("/".join(row) for row in rows)
+
+
+def _metrics(rows: RunRows, pairs: pl.Series, trials: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """(M, P, T) of each of ``METRICS``, NaN where undefined, and (P, T) whether there is such a row."""
+    place = pl.DataFrame({"pair": pairs}).with_row_index("p")
+    column = pl.DataFrame({"trial": pl.Series(trials, dtype=rows.trials.schema["trial"])}).with_row_index("t")
+    found = (
+        rows.lazy.select("trial", pair_key().alias("pair"), *METRICS)
+        .join(column.lazy(), on="trial")
+        .join(place.lazy(), on="pair")
+        .collect(engine="streaming")
     )
-    num_settings = pl.lit(differences["trial"].n_unique()).alias("num_settings")
-    return _summarise(averaged, "detector").with_columns(num_settings)
+    values = np.full((len(METRICS), len(pairs), len(trials)), np.nan)
+    there = np.zeros((len(pairs), len(trials)), bool)
+    p, t = found["p"].to_numpy(), found["t"].to_numpy()
+    there[p, t] = True
+    for k, name in enumerate(METRICS):
+        values[k, p, t] = found[name].fill_null(np.nan).to_numpy()
+    return values, there
 
 
-def _summarise(differences: pl.DataFrame, key: str) -> pl.DataFrame:
-    """Number of pairs, mean and interval of each metric, per value of ``key``."""
-    row, pairs = _codes(differences.select(*_PAIR).rows())
-    column, keys = _codes(differences[key].to_list())
-    summary: dict[str, NDArray[np.float64]] = {}
-    for name in METRICS:
-        values = np.full((len(pairs), len(keys)), np.nan)
-        values[row, column] = differences[name].fill_null(np.nan).to_numpy()
-        ends = bootstrap_means(values)
-        summary |= {f"{name}_{end}": part for end, part in zip(ENDS, ends, strict=True)}
-    num_pairs = np.bincount(column, minlength=len(keys))
-    return pl.DataFrame({key: pl.Series(keys, dtype=differences.schema[key]), "num_pairs": num_pairs} | summary)
+def _summarise(differences: NDArray[np.float64], there: NDArray[np.bool_]) -> dict[str, float]:
+    """Number of pairs, mean and interval of each metric: every pair's mean over its points, then over the pairs.
 
-
-def _codes(values: Sequence[Hashable]) -> tuple[list[int], list[Hashable]]:
-    """The number of each value in order of first appearance, and the values in that order."""
-    numbers: dict[Hashable, int] = {}
-    return [numbers.setdefault(value, len(numbers)) for value in values], list(numbers)
+    Args:
+        differences: (M, P, T) of ``METRICS``.
+        there: (P, T) whether both runs have the row.
+    """
+    some = there.any(1)
+    known = ~np.isnan(differences[:, some])
+    count = known.sum(2)
+    total = np.where(known, differences[:, some], 0).sum(2)
+    averaged = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    parts = dict(zip(ENDS, bootstrap_means(averaged.T), strict=True))
+    found = {f"{name}_{end}": float(parts[end][k]) for k, name in enumerate(METRICS) for end in ENDS}
+    return {"num_pairs": int(some.sum())} | found

@@ -19,8 +19,9 @@ from tensor_stereo.reports.sweep.drawing import (
     run_prefix,
     telling_names,
 )
-from tensor_stereo.reports.sweep.pooling import PERTURBATIONS, decided_by_score, order_detectors
+from tensor_stereo.reports.sweep.pooling import decided_by_score
 from tensor_stereo.reports.sweep.results import RunResults
+from tensor_stereo.reports.sweep.settings import PERTURBATIONS, order_detectors
 from tensor_stereo.reports.sweep.svg import INK, Key, Plot, legend, rate_axis
 
 _VERDICTS = {"cardinality": "circle", "adjacency": "triangle"}
@@ -37,7 +38,7 @@ class _Drawn:
 
 def curve_figures(runs: Sequence[RunResults]) -> str:
     """A ROC and a precision-recall panel per detector, under one legend for marks and lines."""
-    found = [{item.detector: item for item in detector_curves(run.results)} for run in runs]
+    found = [{item.detector: item for item in detector_curves(run.rows.trials)} for run in runs]
     detectors = order_detectors({name for of_run in found for name in of_run})
     chosen = [
         [(k, curve) for k, of_run in enumerate(found) if name in of_run for curve in of_run[name].curves[:MAX_SERIES]]

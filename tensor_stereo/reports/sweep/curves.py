@@ -9,8 +9,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tensor_stereo.reports.sweep.pooling import SETTINGS, mildest, order_detectors, pool_trials, score_counts
-from tensor_stereo.reports.sweep.results import COUNTS
+from tensor_stereo.reports.sweep.pooling import mildest, pool_trials, score_counts
+from tensor_stereo.reports.sweep.rows import COUNTS
+from tensor_stereo.reports.sweep.settings import SETTINGS, order_detectors
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +52,18 @@ class DetectorCurves:
     verdicts: tuple[dict[str, Any], ...]
 
 
-def detector_curves(results: pl.DataFrame) -> list[DetectorCurves]:
+def detector_curves(trials: pl.DataFrame) -> list[DetectorCurves]:
     """Curves of every detector of one run, on the mildest perturbation, with pairs and seeds pooled.
 
     Trials whose pooled scores are the same share a curve: a verdict by another restriction or threshold changes no
     score.
+
+    Args:
+        trials: sums of one run, as :attr:`~tensor_stereo.reports.sweep.rows.RunRows.trials`.
     """
-    if results.is_empty():
+    if trials.is_empty():
         return []
-    pooled = pool_trials(mildest(results), over=("seed",))
+    pooled = pool_trials(mildest(trials), over=("seed",))
     found = []
     for detector in order_detectors(pooled["detector"].unique()):
         of_score: dict[tuple[tuple[int, ...], ...], list[dict[str, Any]]] = {}
@@ -70,10 +74,10 @@ def detector_curves(results: pl.DataFrame) -> list[DetectorCurves]:
             else:
                 of_score.setdefault(tuple(tuple(row[name]) for name in COUNTS), []).append(row)
         curves = []
-        for trials in of_score.values():
-            curve = _curve(trials)
+        for sharing in of_score.values():
+            curve = _curve(sharing)
             if curve is None:
-                verdicts += trials
+                verdicts += sharing
             else:
                 curves.append(curve)
         curves.sort(key=lambda curve: -curve.auc)

@@ -11,17 +11,11 @@ from typing import Any
 import polars as pl
 
 from tensor_stereo.reports.sweep.compare import ENDS, METRICS, Comparison
-from tensor_stereo.reports.sweep.pooling import (
-    SCORE_RATES,
-    SETTINGS,
-    VERDICT_RATES,
-    pool_trials,
-    setting_text,
-    total_seconds,
-    varying_settings,
-)
+from tensor_stereo.reports.sweep.pooling import pool_trials
 from tensor_stereo.reports.sweep.results import RunResults
-from tensor_stereo.reports.sweep.summary import RATE_HEADINGS
+from tensor_stereo.reports.sweep.rows import SCORE_RATES, VERDICT_RATES, total_seconds
+from tensor_stereo.reports.sweep.settings import SETTINGS, setting_text, varying_settings
+from tensor_stereo.reports.sweep.summary import MAX_FAILURES, RATE_HEADINGS
 
 MAX_ROWS = 20_000  # of pairs and trials; more would make a page that no browser likes
 _RATES = VERDICT_RATES + SCORE_RATES
@@ -87,11 +81,11 @@ def script_json(value: Any) -> str:
 
 def trials_data(runs: Sequence[RunResults]) -> DataTable:
     """One row per trial of every run."""
-    frame = _stack([pool_trials(run.results) for run in runs])
+    frame = _stack([pool_trials(run.rows.trials) for run in runs])
     columns = [
         *_run_column(runs, frame),
         Column("trial", frame["trial"].to_list(), decimals=0),
-        *_setting_columns(frame, varying_settings([run.results for run in runs])),
+        *_setting_columns(frame, varying_settings([run.rows.trials for run in runs])),
         Column("pairs", frame["num_pairs"].to_list(), decimals=0),
         Column("matches", frame["num_valid"].to_list(), decimals=0),
         *_rate_columns(frame, group="pairs pooled"),
@@ -103,8 +97,8 @@ def trials_data(runs: Sequence[RunResults]) -> DataTable:
 
 def pairs_data(runs: Sequence[RunResults]) -> DataTable:
     """One row per pair and trial of every run, the first ``MAX_ROWS`` at most."""
-    frames = [run.results.head(MAX_ROWS // len(runs)) for run in runs]
-    frames = [frame.with_columns((total_seconds(frame) * 1000).alias("ms")) for frame in frames]
+    frames = [run.rows.head(MAX_ROWS // len(runs)) for run in runs]
+    frames = [frame.with_columns((total_seconds() * 1000).alias("ms")) for frame in frames]
     names = ("trial", *SETTINGS, "dataset", "scene", "num_valid", "num_untested", *_RATES, "ms")
     frame = _stack([frame.select(names) for frame in frames])
     columns = [
@@ -112,7 +106,7 @@ def pairs_data(runs: Sequence[RunResults]) -> DataTable:
         Column("data set", frame["dataset"].to_list(), select=frame["dataset"].n_unique() > 1),
         Column("scene", frame["scene"].to_list()),
         Column("trial", frame["trial"].to_list(), decimals=0),
-        *_setting_columns(frame, varying_settings([run.results for run in runs])),
+        *_setting_columns(frame, varying_settings([run.rows.trials for run in runs])),
         Column("matches", frame["num_valid"].to_list(), decimals=0),
         Column("untested", frame["num_untested"].to_list(), decimals=0),
         *_rate_columns(frame),
@@ -122,9 +116,9 @@ def pairs_data(runs: Sequence[RunResults]) -> DataTable:
 
 
 def failures_data(runs: Sequence[RunResults]) -> DataTable:
-    """One row per failed unit of every run."""
+    """One row per failed unit of every run, the first ``MAX_FAILURES`` of each at most."""
     names = ("dataset", "scene", "detector", "stage", "error", "message", "attempts")
-    frame = _stack([run.errors.select(names) for run in runs])
+    frame = _stack([run.errors.bottom_k(MAX_FAILURES, by="unit").sort("unit").select(names) for run in runs])
     headings = {"dataset": "data set"}
     columns = [
         Column(
@@ -141,7 +135,7 @@ def failures_data(runs: Sequence[RunResults]) -> DataTable:
 def differences_data(runs: Sequence[RunResults], comparison: Comparison) -> DataTable:
     """One row per point of settings that both runs have."""
     frame = comparison.trials
-    varying = varying_settings([run.results for run in runs])
+    varying = varying_settings([run.rows.trials for run in runs])
     columns = [
         Column("trial of A", frame["trial"].to_list(), decimals=0),
         Column("trial of B", frame["trial_b"].to_list(), decimals=0),
@@ -162,7 +156,7 @@ def only_data(runs: Sequence[RunResults], comparison: Comparison) -> DataTable:
     columns = [
         Column("run", frame["run"].to_list(), select=True),
         Column("trial", frame["trial"].to_list(), decimals=0),
-        *_setting_columns(frame, varying_settings([run.results for run in runs])),
+        *_setting_columns(frame, varying_settings([run.rows.trials for run in runs])),
     ]
     return DataTable("only", "Settings of one run alone", tuple(columns))
 

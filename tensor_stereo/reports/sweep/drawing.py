@@ -9,8 +9,8 @@ from html import escape
 from typing import Any
 
 from tensor_stereo.configs import DETECTORS
-from tensor_stereo.reports.sweep.pooling import SETTINGS, settings_label, telling_settings
 from tensor_stereo.reports.sweep.results import RunResults
+from tensor_stereo.reports.sweep.settings import SETTINGS, settings_label, telling_settings
 from tensor_stereo.reports.sweep.svg import NUM_COLORS, Key, color_class, legend
 
 PAPER_CLAIM = "the paper's claim: specificity around .70 at sensitivity up to .96"

@@ -23,14 +23,15 @@ from tensor_stereo.reports.sweep.drawing import (
     run_prefix,
     telling_names,
 )
-from tensor_stereo.reports.sweep.pooling import SETTINGS, order_detectors, pool_trials, settings_label, stage_times
+from tensor_stereo.reports.sweep.pooling import pool_trials, stage_times
 from tensor_stereo.reports.sweep.results import RunResults
+from tensor_stereo.reports.sweep.settings import SETTINGS, order_detectors, settings_label
 from tensor_stereo.reports.sweep.svg import INK, Axis, Key, Plot, log_axis, name_axis, rate_axis
 
 
 def scatter_figure(runs: Sequence[RunResults]) -> str:
     """Sensitivity and specificity of every trial, pairs pooled, with the paper's headline point."""
-    shown = [(k, row) for k, run in enumerate(runs) for row in pool_trials(run.results).iter_rows(named=True)]
+    shown = [(k, row) for k, run in enumerate(runs) for row in pool_trials(run.rows.trials).iter_rows(named=True)]
     plot = Plot(
         rate_axis(
             "sensitivity: incorrect matches rejected", [PAPER_SENSITIVITY, *(r["sensitivity"] for _, r in shown)]
@@ -61,7 +62,7 @@ def scatter_figure(runs: Sequence[RunResults]) -> str:
 
 def runtime_figure(runs: Sequence[RunResults]) -> str:
     """Mean wall time of every stage and detector; empty if nothing was measured."""
-    rows = [(k, row) for k, run in enumerate(runs) for row in stage_times(run.results).iter_rows(named=True)]
+    rows = [(k, row) for k, run in enumerate(runs) for row in stage_times(run.rows.trials).iter_rows(named=True)]
     stages = list(dict.fromkeys(name for _, row in rows for name in row if name != "detector"))
     stages.sort(key=lambda name: name == "total")  # last, also if a stage is in the second run only
     spent = [row[stage] for _, row in rows for stage in stages if row.get(stage) is not None]
@@ -118,7 +119,7 @@ class _Series:
 
 def perturbation_figures(runs: Sequence[RunResults], name: str) -> str:
     """Rates against ``outlier_rate`` or ``noise_px``, a row of panels per detector; empty if it does not vary."""
-    series = [item for k, run in enumerate(runs) for item in _series(run.results, name, k)]
+    series = [item for k, run in enumerate(runs) for item in _series(run.rows.trials, name, k)]
     values = sorted({row[name] for item in series for row in item.rows})
     if len(values) < 2:
         return ""
@@ -179,10 +180,10 @@ def _panel(
     return plot.render()
 
 
-def _series(results: pl.DataFrame, name: str, run: int) -> list[_Series]:
+def _series(trials: pl.DataFrame, name: str, run: int) -> list[_Series]:
     """One series per point of the other settings, on the least of the other perturbation."""
     other = {"outlier_rate": "noise_px", "noise_px": "outlier_rate"}[name]
-    pooled = pool_trials(results.filter(pl.col(other) == pl.col(other).min().over("detector")), over=("seed",)).sort(
+    pooled = pool_trials(trials.filter(pl.col(other) == pl.col(other).min().over("detector")), over=("seed",)).sort(
         name
     )
     keys = [key for key in SETTINGS if key not in (name, "seed")]

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from tensor_stereo.reports.sweep.compare import Comparison
-from tensor_stereo.reports.sweep.pooling import pool_trials, varying_settings
+from tensor_stereo.reports.sweep.pooling import pool_trials
 from tensor_stereo.reports.sweep.results import RunResults
+from tensor_stereo.reports.sweep.settings import varying_settings
 from tensor_stereo.reports.sweep.summary import (
     EXPLANATION,
     best_table,
     changed_table,
     difference_table,
     environment_table,
+    failure_kinds_table,
     failure_table,
     runtime_table,
     settings_table,
@@ -28,16 +30,16 @@ from tensor_stereo.reports.tables import Table, to_markdown
 def render_markdown(runs: Sequence[RunResults], comparison: Comparison | None) -> str:
     """Summary, settings, trials, run-time, worst pairs, failures and environment; first the differences of two runs."""
     title = " and ".join(_plain(run.name) for run in runs)
-    varying = varying_settings([run.results for run in runs])
+    varying = varying_settings([run.rows.trials for run in runs])
     tables = [summary_table(runs), settings_table(runs)]
     if comparison is not None:
         tables += [changed_table(comparison), difference_table(comparison)]
     tables += [best_table(run) for run in runs]
     for run in runs:
-        tables += trial_tables(run, pool_trials(run.results), varying)
+        tables += trial_tables(run, pool_trials(run.rows.trials), varying)
     tables.append(runtime_table(runs))
     for run in runs:
-        tables += [worst_table(run), failure_table(run), environment_table(run)]
+        tables += [worst_table(run), failure_kinds_table(run), failure_table(run), environment_table(run)]
     parts = [
         f"# Sweep report: {title}\n",
         f"{EXPLANATION}\n",

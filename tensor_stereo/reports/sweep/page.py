@@ -28,14 +28,15 @@ from tensor_stereo.reports.sweep.data_tables import (
 )
 from tensor_stereo.reports.sweep.drawing import run_prefix
 from tensor_stereo.reports.sweep.figures import perturbation_figures, runtime_figure, scatter_figure
-from tensor_stereo.reports.sweep.pooling import PERTURBATIONS
 from tensor_stereo.reports.sweep.results import RunResults
+from tensor_stereo.reports.sweep.settings import PERTURBATIONS
 from tensor_stereo.reports.sweep.summary import (
     EXPLANATION,
     best_table,
     changed_table,
     difference_table,
     environment_table,
+    failure_kinds_table,
     run_counts,
     runtime_table,
     settings_table,
@@ -52,7 +53,7 @@ def render_page(runs: Sequence[RunResults], comparison: Comparison | None) -> st
     sections = [_summary(runs)]
     if comparison is not None:
         sections.append(_comparison(runs, comparison, tables))
-    if any(len(run.results) for run in runs):
+    if any(len(run.rows) for run in runs):
         sections += _measured(runs, tables)
     sections += [_failures(runs, tables), _provenance(runs)]
     style, script = _asset("page.css"), _asset("page.js")
@@ -133,7 +134,7 @@ def _measured(runs: Sequence[RunResults], tables: list[DataTable]) -> list[_Sect
     ]
     headings = {"outlier_rate": "Added outliers", "noise_px": "Added noise"}
     sections += [(name, headings[name], perturbation_figures(runs, name)) for name in PERTURBATIONS]
-    hosts = sorted({host for run in runs for host in run.results["host"].drop_nulls()})
+    hosts = sorted({host for run in runs for names in run.rows.trials["hosts"] for host in names})
     mixed = (
         f"<p class=note>Times of {len(hosts)} hosts are mixed: {escape(', '.join(hosts))}.</p>"
         if len(hosts) > 1
@@ -151,14 +152,23 @@ def _measured(runs: Sequence[RunResults], tables: list[DataTable]) -> list[_Sect
 
 def _pairs(runs: Sequence[RunResults], tables: list[DataTable]) -> str:
     table = pairs_data(runs)
-    total, shown = sum(len(run.results) for run in runs), len(table.columns[0].values)
-    note = f"<p class=note>The first {shown:,} of {total:,} rows; the tables of the run have all.</p>"
-    return (note if shown < total else "") + _mount(table, tables)
+    total, shown = sum(len(run.rows) for run in runs), len(table.columns[0].values)
+    return _excerpt(shown, total) + _mount(table, tables)
+
+
+def _excerpt(shown: int, total: int) -> str:
+    """What a table leaves out, in words."""
+    if shown == total:
+        return ""
+    return f"<p class=note>The first {shown:,} of {total:,} rows; the tables of the run have all.</p>"
 
 
 def _failures(runs: Sequence[RunResults], tables: list[DataTable]) -> _Section:
     if any(len(run.errors) for run in runs):
-        return "failures", "Failed units", _mount(failures_data(runs), tables)
+        kinds = "".join(to_html(failure_kinds_table(run)) for run in runs if len(run.errors))
+        table = failures_data(runs)
+        total, shown = sum(len(run.errors) for run in runs), len(table.columns[0].values)
+        return "failures", "Failed units", kinds + _excerpt(shown, total) + _mount(table, tables)
     return "failures", "Failed units", "<p>None.</p>"
 
 

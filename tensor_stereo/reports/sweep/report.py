@@ -33,16 +33,18 @@ def write_report(runs: Sequence[RunResults], out: Path) -> list[Path]:
         >>> from tensor_stereo.datasets.synthetic.rendering import SyntheticDataset
         >>> from tensor_stereo.evaluation.dataset import score_dataset
         >>> from tensor_stereo.reports.sweep.results import ERROR_COLUMNS
+        >>> from tensor_stereo.reports.sweep.rows import RunRows
         >>> from tensor_stereo.configs import SweepConfig
         >>> table = score_dataset(SyntheticDataset(1), SweepConfig()).with_columns(unit=0, host=pl.lit("here"))
-        >>> run = RunResults("run", table, pl.DataFrame(schema=dict.fromkeys(ERROR_COLUMNS, pl.String)), {}, [])
+        >>> rows = RunRows.of(table)
+        >>> run = RunResults("run", rows, pl.DataFrame(schema=dict.fromkeys(ERROR_COLUMNS, pl.String)), {}, [])
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     [path.name for path in write_report([run], Path(folder))]
         ['report.html', 'report.md']
     """
     if len(runs) not in (1, 2):
         raise ValueError(f"runs must hold one or two runs, got {len(runs)}")
-    comparison = compare_runs(*(run.results for run in runs)) if len(runs) == 2 else None
+    comparison = compare_runs(*(run.rows for run in runs)) if len(runs) == 2 else None
     texts = {"report.html": render_page(runs, comparison), "report.md": render_markdown(runs, comparison)}
     out.mkdir(parents=True, exist_ok=True)
     paths = []

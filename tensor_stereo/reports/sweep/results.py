@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
 
-from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS
+from tensor_stereo.reports.sweep.rows import RunRows
 
-RESULT_COLUMNS = ("unit", *ROW_SCHEMA, "host")
 ERROR_COLUMNS = ("unit", "dataset", "scene", "detector", "stage", "error", "message", "attempts")
-COUNTS = ("score_counts_correct", "score_counts_incorrect")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -42,39 +39,24 @@ class RunResults:
 
     Attributes:
         name: what the report calls the run.
-        results: one row per unit (one pair under one detector setting) and trial (one point of the grid), with the
-            columns of :data:`tensor_stereo.evaluation.dataset.ROW_SCHEMA` and ``unit``, ``host``; none is fine.
+        rows: one per unit and trial, and what they add up to.
         errors: one row per failed unit, columns ``ERROR_COLUMNS``.
         config: settings of the run, ready for JSON.
         environment: versions and machine of each session that worked on the run.
         overlays: pictures of the worst pairs, in the order in which they are shown.
 
     Raises:
-        ValueError: if a column is missing, a unit has two rows for one trial, or a score is not counted in
-            ``SCORE_BINS`` bins.
+        ValueError: if a column of ``errors`` is missing.
     """
 
     name: str
-    results: pl.DataFrame
+    rows: RunRows
     errors: pl.DataFrame
     config: dict[str, Any]
     environment: list[dict[str, Any]]
     overlays: tuple[Overlay, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_columns("results", self.results, RESULT_COLUMNS)
-        _check_columns("errors", self.errors, ERROR_COLUMNS)
-        twice = self.results.filter(self.results.select("unit", "trial").is_duplicated())
-        if len(twice):
-            unit, trial = twice.select("unit", "trial").row(0)
-            raise ValueError(f"results must have one row per unit and trial, got unit {unit}, trial {trial} twice")
-        for name in COUNTS:
-            lengths = set(self.results[name].drop_nulls().list.len()) - {SCORE_BINS}
-            if lengths:
-                raise ValueError(f"results must have {SCORE_BINS} bins in {name}, got {min(lengths)}")
-
-
-def _check_columns(name: str, frame: pl.DataFrame, expected: Iterable[str]) -> None:
-    missing = [column for column in expected if column not in frame.columns]
-    if missing:
-        raise ValueError(f"{name} must have the columns {', '.join(missing)}, got {', '.join(frame.columns)}")
+        missing = [name for name in ERROR_COLUMNS if name not in self.errors.columns]
+        if missing:
+            raise ValueError(f"errors must have the columns {', '.join(missing)}, got {', '.join(self.errors.columns)}")

@@ -6,14 +6,15 @@ import json
 import logging
 from pathlib import Path
 
-import polars as pl
-
-from tensor_stereo.datasets import PairFiles, read_manifest, read_pair
+from tensor_stereo.datasets import read_pair
+from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.evaluation.trials import TrialRunner
 from tensor_stereo.reports.sweep.overlays import draw_overlay
 from tensor_stereo.reports.sweep.pooling import worst_pairs
 from tensor_stereo.reports.sweep.results import Overlay, RunResults
-from tensor_stereo.sweeps import read_config, read_errors, read_results
+from tensor_stereo.reports.sweep.rows import RunRows
+from tensor_stereo.sweeps import read_config, read_errors
+from tensor_stereo.sweeps.results import read_settings, scan_results
 
 LOG = logging.getLogger(__name__)
 
@@ -30,26 +31,26 @@ def load_run(run: Path | str, *, num_overlays: int = 2) -> RunResults:
         FileNotFoundError: if ``run`` is no run folder.
     """
     run = Path(run)
-    results = read_results(run)
+    rows = RunRows.of(scan_results(run), read_settings(run))
     environment = run / "environment.json"
     return RunResults(
         name=run.resolve().name,
-        results=results,
+        rows=rows,
         errors=read_errors(run),
         config=json.loads((run / "config.json").read_text(encoding="utf-8")),
         environment=json.loads(environment.read_text(encoding="utf-8")) if environment.exists() else [],
-        overlays=tuple(_overlays(run, results, num_overlays)),
+        overlays=tuple(_overlays(run, rows, num_overlays)),
     )
 
 
-def _overlays(run: Path, results: pl.DataFrame, num_pairs: int) -> list[Overlay]:
+def _overlays(run: Path, rows: RunRows, num_pairs: int) -> list[Overlay]:
     if num_pairs == 0:
         return []
-    files = {(pair.dataset, pair.scene): pair for pair in read_manifest(run / "manifest.parquet", check_files=False)}
+    table = PairTable(run / "manifest.parquet", check_files=False)
     trials = read_config(run).trials
     drawn = []
-    for row in worst_pairs(results, num_pairs).iter_rows(named=True):
-        pair: PairFiles = files[row["dataset"], row["scene"]]
+    for row in worst_pairs(rows, num_pairs).iter_rows(named=True):
+        pair = table.find(row["dataset"], row["scene"])
         try:
             trial = TrialRunner(read_pair(pair)).run(trials[row["trial"]])
         except (OSError, ValueError) as error:

@@ -10,19 +10,16 @@ import polars as pl
 
 from tensor_stereo.reports.sweep.compare import METRICS, Comparison
 from tensor_stereo.reports.sweep.drawing import run_prefix
-from tensor_stereo.reports.sweep.pooling import (
+from tensor_stereo.reports.sweep.pooling import best_trials, stage_times, worst_pairs
+from tensor_stereo.reports.sweep.results import RunResults
+from tensor_stereo.reports.sweep.rows import SCORE_RATES, VERDICT_RATES
+from tensor_stereo.reports.sweep.settings import (
     PERTURBATIONS,
-    SCORE_RATES,
     SETTINGS,
-    VERDICT_RATES,
-    best_trials,
     setting_text,
     settings_label,
-    stage_times,
     varying_settings,
-    worst_pairs,
 )
-from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.tables import Cell, Table
 
 RATE_HEADINGS = {
@@ -42,18 +39,19 @@ EXPLANATION = (
     "matches, and equal to NPV and specificity; spec.@.96 is the specificity that a score reaches at "
     "sensitivity .96."
 )
+MAX_FAILURES = 1000  # of one run, written out
 _MAX_VALUES = 12  # of a setting, written out
 
 
 def run_counts(run: RunResults) -> dict[str, int]:
     """How much a run holds."""
-    results = run.results
+    units = run.rows.units
     return {
-        "pairs": results.select("dataset", "scene").n_unique() if len(results) else 0,
-        "units": results["unit"].n_unique(),
-        "trials": results["trial"].n_unique(),
-        "rows": len(results),
-        "pairs outside of the domain": results.filter(pl.col("domain") != "").select("dataset", "scene").n_unique(),
+        "pairs": units["pair"].n_unique(),
+        "units": units["unit"].n_unique(),
+        "trials": len(run.rows.trials),
+        "rows": len(units),
+        "pairs outside of the domain": units.filter("is_outside")["pair"].n_unique(),
         "failed units": run.errors["unit"].n_unique(),
     }
 
@@ -69,10 +67,10 @@ def summary_table(runs: Sequence[RunResults]) -> Table:
 
 def settings_table(runs: Sequence[RunResults]) -> Table:
     """What varies in the grid, what follows from it and what is the same everywhere, a row per setting."""
-    varying = varying_settings([run.results for run in runs])
+    varying = varying_settings([run.rows.trials for run in runs])
     rows: list[tuple[Cell, ...]] = []
     for name in [*varying, *(name for name in SETTINGS if name not in varying)]:
-        values = pl.concat([run.results[name] for run in runs]).unique().sort(nulls_last=True).to_list()
+        values = pl.concat([run.rows.trials[name] for run in runs]).unique().sort(nulls_last=True).to_list()
         texts: list[str] = [setting_text(name, value) for value in values]
         more = f", ... ({len(texts)} values)" if len(texts) > _MAX_VALUES else ""
         role = "varies" if name in varying else "follows another" if len(texts) > 1 else "fixed"
@@ -86,7 +84,7 @@ def best_table(run: RunResults) -> Table:
     rates = ("fraction_incorrect", "sensitivity", "specificity", *SCORE_RATES)
     rows = tuple(
         (row["detector"].upper(), row["trial"], settings_label(row, names), *(_number(row[name]) for name in rates))
-        for row in best_trials(run.results).iter_rows(named=True)
+        for row in best_trials(run.rows.trials).iter_rows(named=True)
     )
     columns = ("detector", "trial", "settings", *(RATE_HEADINGS[name] for name in rates))
     title = f"{run.name}: highest mean of sensitivity and specificity on the mildest perturbation, pairs pooled"
@@ -116,7 +114,7 @@ def trial_tables(run: RunResults, pooled: pl.DataFrame, varying: Sequence[str]) 
 
 def runtime_table(runs: Sequence[RunResults]) -> Table:
     """Mean ms by stage and detector, over the rows in which a stage ran."""
-    times = [stage_times(run.results) for run in runs]
+    times = [stage_times(run.rows.trials) for run in runs]
     stages = list(dict.fromkeys(name for frame in times for name in frame.columns[1:]))
     stages.sort(key=lambda name: name == "total")
     rows = tuple(
@@ -141,19 +139,33 @@ def worst_table(run: RunResults) -> Table:
             row["num_valid"],
             *(row[name] for name in rates),
         )
-        for row in worst_pairs(run.results).iter_rows(named=True)
+        for row in worst_pairs(run.rows).iter_rows(named=True)
     )
     return Table(f"{run.name}: pairs on which even the best trial does badly", columns, rows, decimals=3)
 
 
 def failure_table(run: RunResults) -> Table:
-    """Units without a result, and why."""
+    """Units without a result, and why; the first ``MAX_FAILURES`` at most."""
     columns = ("pair", "detector", "stage", "error", "message", "attempts")
-    rows = tuple(
-        (pair_name(row), *(_text(row[name]) for name in columns[1:]))
-        for row in run.errors.sort("unit").iter_rows(named=True)
+    shown = run.errors.bottom_k(MAX_FAILURES, by="unit").sort("unit")
+    rows = tuple((pair_name(row), *(_text(row[name]) for name in columns[1:])) for row in shown.iter_rows(named=True))
+    which = (
+        f"the first {len(shown):,} of {len(run.errors):,} failed units"
+        if len(shown) < len(run.errors)
+        else "failed units"
     )
-    return Table(f"{run.name}: failed units", columns, rows)
+    return Table(f"{run.name}: {which}", columns, rows)
+
+
+def failure_kinds_table(run: RunResults) -> Table:
+    """How many units failed by what, the most frequent first."""
+    kinds = (
+        run.errors.group_by("stage", "error")
+        .len("units")
+        .sort("units", "stage", "error", descending=[True, False, False])
+    )
+    rows = tuple((_text(stage), _text(error), units) for stage, error, units in kinds.rows())
+    return Table(f"{run.name}: failed units by error", ("stage", "error", "units"), rows)
 
 
 def environment_table(run: RunResults) -> Table:
@@ -204,7 +216,7 @@ def pair_name(row: Mapping[str, Any]) -> str:
 
 def _mild_names(run: RunResults) -> list[str]:
     """Settings worth a label where run and detector are named and the perturbation is the mildest."""
-    return [name for name in varying_settings([run.results]) if name not in ("detector", *PERTURBATIONS)]
+    return [name for name in varying_settings([run.rows.trials]) if name not in ("detector", *PERTURBATIONS)]
 
 
 def flatten(value: Any, name: str = "") -> dict[str, str]:

@@ -48,9 +48,9 @@ def test_workers_of_a_sweep_wait_passively() -> None:
     code = (
         "import os\n"
         "from tensor_stereo.configs import SweepConfig\n"
-        "from tensor_stereo.sweeps.engines import LocalEngine\n"
+        "from tensor_stereo.sweeps.engines import local_engine\n"
         "if __name__ == '__main__':\n"
-        "    engine = LocalEngine(SweepConfig(), 1)\n"
+        "    engine = local_engine(SweepConfig(), 1)\n"
         "    engine._start_worker()\n"
         "    (worker,) = engine._workers.values()\n"
         "    told = open(f'/proc/{worker.process.pid}/environ', 'rb').read().split(b'\\0')\n"

@@ -62,13 +62,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ValueError as error:  # of the settings' own checks; tyro exits by itself
         sys.exit(fail(_one_line(error), BAD_INPUT))
     from tensor_stereo.sweeps.journal import SweepError
+    from tensor_stereo.workers import WorkerStartError
 
     try:
         check(command)
         run = _runner(command)
         with _warnings_in_one_line():
             code = run(command)
-    except (ValueError, TypeError, ImportError, SweepError, OSError, UserWarning) as error:
+    except (ValueError, TypeError, ImportError, SweepError, WorkerStartError, OSError, UserWarning) as error:
         sys.exit(fail(_one_line(error), BAD_INPUT))
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "allocate memory" not in str(error):

@@ -17,10 +17,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tensor_stereo.sweeps.batches import make_batch
-from tensor_stereo.sweeps.engines import Engine, Outcome
+from tensor_stereo.sweeps.batches import BatchResult, make_batch
+from tensor_stereo.sweeps.engines import Engine
 from tensor_stereo.sweeps.plan import Plan, Task, failed_unit
 from tensor_stereo.sweeps.store import RunStore
+from tensor_stereo.workers import Outcome
 
 MAX_DEATHS = 2  # workers that certainly died at a unit before it counts as failed
 BATCH_SECONDS = 1.0  # about: long against the way to a worker and back, short against a user's patience
@@ -137,7 +138,7 @@ class _Driver:
     def _is_waiting(self) -> bool:
         return self._next < len(self._todo) or bool(self._suspects or self._returned)
 
-    def _take(self, outcome: Outcome) -> None:
+    def _take(self, outcome: Outcome[Task, BatchResult]) -> None:
         """Store the results of a batch, or try its units again one by one."""
         result = outcome.result
         if result is None:

@@ -14,9 +14,10 @@ from typing import Any
 
 from tensor_stereo.configs import SweepConfig
 from tensor_stereo.sweeps.batches import BatchResult
-from tensor_stereo.sweeps.engines import Outcome, run_batch
+from tensor_stereo.sweeps.engines import run_batch
 from tensor_stereo.sweeps.plan import Task
 from tensor_stereo.waiting import chosen_policy
+from tensor_stereo.workers import Outcome
 
 
 def find_ray() -> Any:
@@ -74,7 +75,7 @@ class RayEngine:
             batch = self._waiting.popleft()
             self._running[self._task.remote(self._config, batch)] = batch
 
-    def collect(self, timeout_seconds: float) -> list[Outcome]:
+    def collect(self, timeout_seconds: float) -> list[Outcome[Task, BatchResult]]:
         ray = self._ray
         if not self._running:
             return []

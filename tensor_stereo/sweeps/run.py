@@ -14,7 +14,7 @@ from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.paths import check_no_store
 from tensor_stereo.sweeps.driver import SweepProgress, SweepSummary, drive
-from tensor_stereo.sweeps.engines import Engine, LocalEngine, check_points
+from tensor_stereo.sweeps.engines import Engine, check_points, local_engine
 from tensor_stereo.sweeps.grid import simplify
 from tensor_stereo.sweeps.log import log_to_file
 from tensor_stereo.sweeps.plan import build_plan
@@ -73,7 +73,8 @@ def run_sweep(
 
     Raises:
         ValueError: for bad settings, a wrong manifest, or a run folder of another configuration.
-        SweepError: if another process works on the same shard, or no worker starts.
+        SweepError: if another process works on the same shard.
+        RuntimeError: if no worker starts.
         OSError: if the run folder cannot be written; what its journal lists is safe.
     """
     out = Path(out)
@@ -115,7 +116,7 @@ def run_sweep(
         workers: Engine | None = None
         if len(todo):
             local = engine == "local"
-            workers = LocalEngine(config, num_workers) if local else RayEngine(config, num_workers, ray_address)
+            workers = local_engine(config, num_workers) if local else RayEngine(config, num_workers, ray_address)
         summary = drive(workers, plan, store, units, todo, num_found, on_progress)
         LOG.info("end", extra={"interrupted": summary.interrupted, **asdict(summary.progress)})
         return summary

@@ -21,10 +21,13 @@ from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets import read_image, read_manifest, write_pfm
 from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.sweeps import SweepProgress, build_plan, expand_grid, read_errors, read_results, run_sweep
+from tensor_stereo.sweeps.batches import BatchResult
 from tensor_stereo.sweeps.driver import MAX_DEATHS, drive
-from tensor_stereo.sweeps.engines import LocalEngine, Outcome
+from tensor_stereo.sweeps.engines import local_engine
+from tensor_stereo.sweeps.plan import Task
 from tensor_stereo.sweeps.store import FORMAT, RunStore
 from tensor_stereo.sweeps.units import run_tasks
+from tensor_stereo.workers import Outcome
 from tests.sweeps.conftest import Inputs, assert_same, make_manifest, stored, write_pairs
 
 FAST = SweepConfig(expand_grid([{"detector": "fast", "verdict": "cardinality"}]))
@@ -144,7 +147,7 @@ class _DeadlyEngine:
     def submit(self, tasks) -> None:
         self.under_way.append(tuple(tasks))
 
-    def collect(self, timeout_seconds: float) -> list[Outcome]:
+    def collect(self, timeout_seconds: float) -> list[Outcome[Task, BatchResult]]:
         tasks = self.under_way.pop()
         dies = bool(self.deadly & {task.unit for task in tasks})
         return [Outcome(tasks, None if dies else run_tasks(self.config, tasks))]
@@ -175,7 +178,7 @@ def test_a_worker_that_dies_at_work_is_noticed_and_replaced(inputs: Inputs) -> N
     grid = {"verdict": "cardinality", "score": "topology", "seed": list(range(240)), "outlier_rate": 0.5}
     config = SweepConfig(expand_grid([grid]), export_matches=True)
     plan = build_plan(config, read_manifest(inputs.manifest))
-    engine = LocalEngine(config, 1)
+    engine = local_engine(config, 1)
     try:
         engine.submit([plan.task(0)])
         assert engine.collect(PATIENCE_S) == []  # it has begun

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
+import torch
+from torch import Tensor
 
 from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES
 from tensor_stereo.reports.sweep.settings import SETTINGS
@@ -137,35 +137,30 @@ def _sums() -> Iterable[pl.Expr]:
 def _scores(lazy: pl.LazyFrame, num_rows: int) -> pl.DataFrame:
     """The sums of ``COUNTS`` per trial, null where a row has none."""
     trials: list[int] = lazy.select("trial").unique().collect()["trial"].sort().to_list()
-    sums: NDArray[np.int64] = np.zeros((2, len(trials), SCORE_BINS), np.int64)
+    sums = torch.zeros(2, len(trials), SCORE_BINS, dtype=torch.int64)
     unscored = np.zeros(len(trials), bool)
-    seen = 0
+    num_seen = 0
     for batch in lazy.select("trial", *COUNTS).collect_batches(chunk_size=_BATCH):
-        seen += len(batch)
-        place = np.searchsorted(trials, batch["trial"].to_numpy())
-        has = (batch[COUNTS[0]].is_not_null() & batch[COUNTS[1]].is_not_null()).to_numpy()
-        unscored[place[~has]] = True
-        if has.any():
-            of_trial = csr_array(
-                (np.ones(has.sum(), np.int64), (place[has], np.arange(has.sum()))), (len(trials), has.sum())
-            )
-            for k, name in enumerate(COUNTS):
-                sums[k] += of_trial @ _bins(name, batch[name].drop_nulls() if has.all() else batch.filter(has)[name])
-    if seen < num_rows:
-        raise OSError(f"only {seen} of {num_rows} rows can be decoded")
+        num_seen += len(batch)
+        scored = batch.drop_nulls(COUNTS)
+        place = np.searchsorted(trials, scored["trial"].to_numpy())
+        for k, name in enumerate(COUNTS):
+            sums[k].index_add_(0, torch.from_numpy(place), _bins(name, scored[name]))
+        without = batch.filter(pl.any_horizontal(pl.col(COUNTS).is_null()))["trial"].unique()
+        unscored[np.searchsorted(trials, without.to_numpy())] = True
+    if num_seen < num_rows:
+        raise OSError(f"only {num_seen} of {num_rows} rows can be decoded")
     lists = {
-        name: pl.Series(
-            [None if skip else row for skip, row in zip(unscored, part.tolist(), strict=True)], dtype=ROW_SCHEMA[name]
-        )
-        for name, part in zip(COUNTS, sums, strict=True)
+        name: [None if skip else row for skip, row in zip(unscored, part, strict=True)]
+        for name, part in zip(COUNTS, sums.tolist(), strict=True)
     }
-    return pl.DataFrame({"trial": pl.Series(trials, dtype=ROW_SCHEMA["trial"])} | lists)
+    schema = {name: ROW_SCHEMA[name] for name in ("trial", *COUNTS)}
+    return pl.DataFrame({"trial": trials} | lists, schema=schema)
 
 
-def _bins(name: str, lists: pl.Series) -> NDArray[np.int64]:
+def _bins(name: str, lists: pl.Series) -> Tensor:
     """(N, SCORE_BINS) of N lists."""
-    lengths: Sequence[int] = lists.list.len().unique().to_list()
-    wrong = [length for length in lengths if length != SCORE_BINS]
+    wrong = [length for length in lists.list.len().unique() if length != SCORE_BINS]
     if wrong:
         raise ValueError(f"results must have {SCORE_BINS} bins in {name}, got {min(wrong)}")
-    return lists.explode().to_numpy().reshape(-1, SCORE_BINS)
+    return torch.from_numpy(lists.explode().to_numpy().reshape(-1, SCORE_BINS).copy())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Generic, NamedTuple, TypeVar
@@ -13,9 +13,11 @@ from tensor_stereo.atomic import append_line, drop_torn_line, whole_file
 from tensor_stereo.locks import lock
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
-_ONE_SOURCE_FAILS = (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError)
+ONE_SOURCE_FAILS = (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError)
 
 Summary = TypeVar("Summary")
+Run = Callable[[Sequence[int]], Iterator[tuple[int, Summary | Exception]]]
+"""Makes the results of some sources, by their numbers, and tells of each, in any order, or why there is none."""
 
 
 class Source(NamedTuple):
@@ -49,16 +51,44 @@ class Worked(Generic[Summary]):
     summaries: dict[str, Summary] = field(default_factory=dict)
 
 
+def check_shard(shard: tuple[int, int]) -> None:
+    """Raise ValueError unless ``shard`` is (i, n) with 1 <= i <= n."""
+    if not 1 <= shard[0] <= shard[1]:
+        raise ValueError(f"shard must be i/n with 1 <= i <= n, got {shard[0]}/{shard[1]}")
+
+
+def in_turn(make: Callable[[int], Summary]) -> Run[Summary]:
+    """Make one result after the other in this process.
+
+    >>> list(in_turn(lambda number: 10 // number)([2, 5]))
+    [(2, 5), (5, 2)]
+    """
+
+    def run(numbers: Sequence[int]) -> Iterator[tuple[int, Summary | Exception]]:
+        for number in numbers:
+            outcome: Summary | Exception
+            try:
+                outcome = make(number)
+            except ONE_SOURCE_FAILS as error:
+                outcome = error
+            yield number, outcome
+
+    return run
+
+
 class ResultFolder(Generic[Summary]):
     """A folder of results of some settings, with a file of these settings and a journal of what is done.
 
+    Several calls can share the work: each takes one shard of the sources, with a journal of its own.
+
     Args:
         out: The folder; it exists.
-        kind: Name of both files: ``KIND.json`` and ``KIND.jsonl``.
+        kind: Name of both files: ``KIND.json`` and ``KIND.jsonl``, ``KIND-i-of-n.jsonl`` of a shard.
         settings: What all results depend on, as JSON.
         defaults: Settings that files of earlier releases lack.
         to_json: A summary as the journal holds it.
         from_json: Back again; it raises for what is none.
+        shard: (i, n): only every n-th source is worked on, from the i-th on, counted from 1.
     """
 
     def __init__(
@@ -70,28 +100,35 @@ class ResultFolder(Generic[Summary]):
         defaults: dict[str, Any] | None = None,
         to_json: Callable[[Summary], dict[str, Any]],
         from_json: Callable[[dict[str, Any]], Summary],
+        shard: tuple[int, int] = (1, 1),
     ) -> None:
         self.out, self.settings, self.defaults = out, json.loads(json.dumps(settings)), defaults or {}
-        self.settings_file, self.journal_file = out / f"{kind}.json", out / f"{kind}.jsonl"
+        self.kind, self.shard = kind, shard
+        name = kind if shard == (1, 1) else f"{kind}-{shard[0]}-of-{shard[1]}"
+        self.settings_file, self.journal_file = out / f"{kind}.json", out / f"{name}.jsonl"
         self._to_json, self._from_json = to_json, from_json
 
     def work(
         self,
         sources: Sequence[Source],
-        run: Callable[[int], Summary],
+        run: Run[Summary],
         on_progress: Callable[[int, int, str], None] | None = None,
         on_end: Callable[[dict[str, Summary]], None] | None = None,
     ) -> Worked[Summary]:
         """Make the results that are not there, or whose sources have changed; those that failed are tried again.
 
         Args:
-            sources: All of them.
-            run: Makes the result of a source, by its number, and tells of it.
+            sources: All of them, also those of other shards.
+            run: As :func:`in_turn` gives it.
             on_progress: Called after each source with the number of sources done, their total and the name.
-            on_end: Called with the summaries at the end, also that by an error, while the folder is locked.
+            on_end: Called with the summaries of all sources that are done, also by other calls, at the end, also that
+                by an error, while the shard is locked.
+
+        Returns:
+            Counts and errors of this shard, and the same summaries.
 
         Raises:
-            ValueError: If another call works on the folder, or it holds results of other settings.
+            ValueError: If another call works on the shard, or the folder holds results of other settings.
             OSError: If nothing can be written to it.
         """
         worked: Worked[Summary] = Worked()
@@ -100,48 +137,67 @@ class ResultFolder(Generic[Summary]):
                 raise ValueError(f"out: another call works on {self.out}; wait for it or name another folder")
             self._claim()
             drop_torn_line(journal, self.journal_file)
-            known = self._read_journal()
             try:
-                num_found = self._work(sources, run, on_progress, journal, known, worked)
+                num_found = self._work(sources, run, on_progress, journal, worked)
             finally:
+                known = self._find(sources) | worked.summaries
+                summaries = {source.name: known[source.name] for source in sources if source.name in known}
                 if on_end is not None:
-                    on_end(worked.summaries)
-        return Worked(num_found, worked.errors, worked.summaries)
+                    on_end(summaries)
+        return Worked(num_found, worked.errors, summaries)
 
     def _work(
         self,
         sources: Sequence[Source],
-        run: Callable[[int], Summary],
+        run: Run[Summary],
         on_progress: Callable[[int, int, str], None] | None,
         journal: IO[bytes],
-        known: dict[str, dict[str, Any]],
         worked: Worked[Summary],
     ) -> int:
         """Fill ``worked``; how many sources were done before."""
-        num_found = 0
-        for number, source in enumerate(sources):
-            entry, stamp = known.get(source.name), _stamp(source)
-            if entry is not None and entry["stamp"] == stamp and _sizes(source.results) == entry["size"]:
-                num_found += 1
-                worked.summaries[source.name] = self._from_json(entry["summary"])
-            else:
-                try:
-                    summary = run(number)
-                except _ONE_SOURCE_FAILS as error:
-                    if isinstance(error, OSError) and error.errno in _NO_ROOM:
-                        raise
-                    worked.errors[source.name] = " ".join(str(error).split())
-                    if entry is not None and stamp and stamp != entry["stamp"]:  # of what the source was
-                        for path in source.results:
-                            path.unlink(missing_ok=True)
-                else:
-                    worked.summaries[source.name] = summary
-                    done = {"name": source.name, "stamp": stamp, "size": _sizes(source.results)}
-                    line = json.dumps(done | {"summary": self._to_json(summary)}, separators=(",", ":"))
-                    append_line(line.encode(), journal)
+        mine = range(self.shard[0] - 1, len(sources), self.shard[1])
+        stamps = {number: _stamp(sources[number]) for number in mine}
+        known, found = self._read_journals(), self._find(sources)
+        num_done = 0
+
+        def tell(name: str) -> None:
+            nonlocal num_done
+            num_done += 1
             if on_progress is not None:
-                on_progress(number + 1, len(sources), source.name)
+                on_progress(num_done, len(mine), name)
+
+        todo = [number for number in mine if sources[number].name not in found]
+        num_found = len(mine) - len(todo)
+        for number in mine:
+            if sources[number].name in found:
+                tell(sources[number].name)
+        for number, outcome in run(todo):
+            source, stamp = sources[number], stamps[number]
+            if isinstance(outcome, Exception):
+                if isinstance(outcome, OSError) and outcome.errno in _NO_ROOM:
+                    raise outcome
+                worked.errors[source.name] = " ".join(str(outcome).split())
+                entries = known.get(source.name, [])
+                if entries and stamp and all(stamp != entry["stamp"] for entry in entries):  # of what the source was
+                    for path in source.results:
+                        path.unlink(missing_ok=True)
+            else:
+                worked.summaries[source.name] = outcome
+                done = {"name": source.name, "stamp": stamp, "size": _sizes(source.results)}
+                line = json.dumps(done | {"summary": self._to_json(outcome)}, separators=(",", ":"))
+                append_line(line.encode(), journal)
+            tell(source.name)
         return num_found
+
+    def _find(self, sources: Sequence[Source]) -> dict[str, Summary]:
+        """What is told of each source that is done, and has not changed since."""
+        known, found = self._read_journals(), {}
+        for source in sources:
+            state = _stamp(source), _sizes(source.results)
+            for entry in known.get(source.name, []):
+                if (entry["stamp"], entry["size"]) == state:
+                    found[source.name] = self._from_json(entry["summary"])
+        return found
 
     def _claim(self) -> None:
         """Make this the folder of the settings, or raise if it is that of others."""
@@ -159,14 +215,16 @@ class ResultFolder(Generic[Summary]):
         with whole_file(path) as part:
             part.write_text(json.dumps(self.settings, indent=1) + "\n", encoding="utf-8")
 
-    def _read_journal(self) -> dict[str, dict[str, Any]]:
-        """The last entry of each source that is done; a line that the end of its process has torn does not count."""
-        entries: dict[str, dict[str, Any]] = {}
-        for line in self.journal_file.read_bytes().splitlines():
+    def _read_journals(self) -> dict[str, list[dict[str, Any]]]:
+        """All entries of each source; a line that the end of its process has torn does not count."""
+        entries: dict[str, list[dict[str, Any]]] = {}
+        journals = sorted({*self.out.glob(f"{self.kind}-*-of-*.jsonl"), self.out / f"{self.kind}.jsonl"})
+        lines = [line for path in journals if path.exists() for line in path.read_bytes().splitlines()]
+        for line in lines:
             try:
                 entry = json.loads(line)
                 self._from_json(entry["summary"])
-                entries[entry["name"]] = {"stamp": None, "size": None} | entry
+                entries.setdefault(entry["name"], []).append({"stamp": None, "size": None} | entry)
             except (ValueError, TypeError, KeyError):
                 continue
         return entries

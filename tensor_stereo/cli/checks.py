@@ -68,6 +68,9 @@ def _check_confidence(command: Confidence) -> None:
         return
     if command.ending is not None:
         raise ValueError("ending must not be given without a manifest: that of --out counts")
+    for name in ("workers", "shard"):
+        if getattr(command, name) is not None:
+            raise ValueError(f"{name} must not be given without a manifest")
     for name in ("right", "disparity"):
         if getattr(command, name) is None:
             raise ValueError(f"{name} must be given beside left, unless left is a manifest, .csv or .parquet")
@@ -81,6 +84,9 @@ def _check_confidence(command: Confidence) -> None:
 def _check_maps(command: Confidence) -> None:
     """A manifest of maps; what it names itself cannot be given beside it."""
     check_source("left", command.left)
+    parse_shard(command.shard or "1/1")
+    if command.workers is not None:
+        _check_least("workers", command.workers, 1)
     columns = {"disparity1": "disparity1_est", "scale": "est_scale"} | {
         name: name for name in ("right", "disparity", "disparity_gt", "gt_scale", "sample_bits")
     }

@@ -94,6 +94,10 @@ class Confidence:
     files, one per pair, and of confidence.parquet, one row per pair."""
     ending: Literal[".png", ".pfm", ".npy", ".tiff"] | None = None
     """Of the files in that folder; .png if not given."""
+    workers: int | None = None
+    """Maps of a manifest at a time, in processes of one thread; one, with all threads, if not given."""
+    shard: str | None = None
+    """i/n: the i-th of n parts of a manifest, as for an array of jobs."""
     figure: Path | None = None
     """PNG of the map, its confidence, what is kept and, with ground truth, its errors."""
 

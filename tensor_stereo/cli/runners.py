@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
+from tensor_stereo.cli.checks import parse_shard
 from tensor_stereo.cli.commands import (
     Classify,
     Confidence,
@@ -222,7 +223,8 @@ def _run_confidence(command: Confidence) -> int:
         return _run_confidence_of_manifest(command)
     from tensor_stereo.reports.confidence import score_disparity_files
 
-    settings = {name: value for name, value in vars(command).items() if name != "ending"}
+    of_manifests = ("ending", "workers", "shard")
+    settings = {name: value for name, value in vars(command).items() if name not in of_manifests}
     summary = score_disparity_files(**settings)
     values = asdict(summary)
     for name, value in (values | values.pop("rates")).items():
@@ -244,6 +246,8 @@ def _run_confidence_of_manifest(command: Confidence) -> int:
             command.left,
             command.out,  # type: ignore[arg-type]
             ending=command.ending or ".png",
+            num_workers=command.workers or 1,
+            shard=parse_shard(command.shard or "1/1"),
             **{name: getattr(command, name) for name in taken},
             on_progress=lambda done, total, name: show(done, total, f"{name}, {time_left(begun, done, total)}"),
         )

@@ -122,3 +122,23 @@ def write_confidence(path: StrPath, probability: NDArray[np.float32]) -> None:
             if has_ending(path, ".png"):
                 stored = np.rint(probability.astype(np.float64) * _FULL).astype(np.uint16)
             part.write_bytes(cv2.imencode(ending_of(path), stored)[1].tobytes())
+
+
+def read_confidence(path: StrPath) -> NDArray[np.float32]:
+    """Read probabilities that :func:`write_confidence` has written.
+
+    Returns:
+        (H, W) float32 in [0, 1], 0 where unknown.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_confidence(f"{folder}/c.png", np.array([[0, 0.25]], np.float32))
+    ...     read_confidence(f"{folder}/c.png").round(3)
+    array([[0.  , 0.25]], dtype=float32)
+    """
+    values = read_map(path, scale=_FULL if has_ending(Path(path), ".png") else None, name="confidence")
+    return np.nan_to_num(values, nan=0.0)

@@ -13,7 +13,7 @@ from tensor_stereo.interop.match_files import filter_file
 from tensor_stereo.interop.match_lists import KIND, MatchFile, find_match_files
 from tensor_stereo.interop.verdicts import FilterSummary
 from tensor_stereo.paths import check_folder, has_ending
-from tensor_stereo.result_folders import ResultFolder, Source
+from tensor_stereo.result_folders import ResultFolder, Source, in_turn
 
 _LATER = {"images": None, "repair": False, "refine": False}  # settings that earlier releases did not have
 
@@ -93,9 +93,8 @@ def filter_files(
         out, KIND, settings, defaults=_LATER, to_json=asdict, from_json=lambda values: FilterSummary(**values)
     )
     sources = [_source(file, out / file.name) for file in files]
-    worked = folder.work(
-        sources, lambda k: _filter_one(files[k], out / files[k].name, score_name, config, looks), on_progress
-    )
+    run = in_turn(lambda k: _filter_one(files[k], out / files[k].name, score_name, config, looks))
+    worked = folder.work(sources, run, on_progress)
     total = sum(worked.summaries.values(), start=FilterSummary())
     return FolderSummary(len(files), worked.num_found, worked.errors, total)
 

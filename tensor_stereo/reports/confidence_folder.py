@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
+from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import polars as pl
 import torch
 from torch import Tensor
@@ -22,8 +26,9 @@ from tensor_stereo.dense.confidence import WEIGHTS, DisparityConfidence, check_v
 from tensor_stereo.paths import MAPS, TABLES, check_ending, check_source, prepare_folder
 from tensor_stereo.reports.confidence import RATES, ConfidenceSummary, summarize_confidence
 from tensor_stereo.reports.tables import Table
-from tensor_stereo.result_folders import ResultFolder, Source
+from tensor_stereo.result_folders import ONE_SOURCE_FAILS, ResultFolder, Source, check_shard, in_turn
 from tensor_stereo.table_files import write_table
+from tensor_stereo.workers import WorkerPool
 
 KIND = "confidence"  # of the results: confidence.json, confidence.jsonl, confidence.parquet
 _SHOWN = ("bad", "bad_kept", "epe_px", "epe_px_kept", "sparsification", "sparsification_optimum")
@@ -34,10 +39,10 @@ class ManifestSummary:
     """What became of the maps of a manifest.
 
     Attributes:
-        num_pairs: All pairs.
+        num_pairs: All pairs of the shard.
         num_found: Those that an earlier call has finished.
         errors: Reason of each pair that failed, by its dataset and scene.
-        frame: One row for each of the others; see :func:`confidence_frame`.
+        frame: One row for each pair that is done, also by calls for other shards; see :func:`confidence_frame`.
         table: The file of these rows.
     """
 
@@ -59,6 +64,8 @@ def score_disparity_manifest(
     stride: int = 1,
     threshold: float | None = None,
     min_precision: float | None = None,
+    num_workers: int = 1,
+    shard: tuple[int, int] = (1, 1),
     on_progress: Callable[[int, int, str], None] | None = None,
 ) -> ManifestSummary:
     """How likely is every pixel of the disparity maps of many pairs right, and what is left of their errors?
@@ -80,6 +87,9 @@ def score_disparity_manifest(
         stride: Distance of the pixels that are judged.
         threshold: Least probability of a kept pixel; None: .5, unless ``min_precision`` is given.
         min_precision: Least expected share of the kept pixels of each map that is right.
+        num_workers: Processes of one thread each; 1: this process, with all of its threads. About 1 GB each.
+        shard: (i, n): the i-th of n parts of the pairs, counted from 1, as for an array of jobs. The table has the
+            pairs of all calls that have ended.
         on_progress: Called after each pair with the number of pairs done, their total and the name of the pair.
 
     Returns:
@@ -94,29 +104,21 @@ def score_disparity_manifest(
     manifest, out = Path(manifest), Path(out)
     pairs, sources = find_maps(manifest, out, ending)
     check_verdict(threshold, min_precision)
+    check_shard(shard)
+    if num_workers < 1:
+        raise ValueError(f"num_workers must be at least 1, got {num_workers}")
     prepare_folder("out", out)
-    confidence = DisparityConfidence(max_error_px, max_error_share, stride)
-    tolerance = {"max_error_px": max_error_px, "max_error_share": max_error_share}
-    verdict = {"threshold": threshold, "min_precision": min_precision}
+    job = _Job(unknown, max_error_px, max_error_share, stride, threshold, min_precision)
+    _network(job)  # which checks the settings
+    tasks = [_Task(pair, source.results[0]) for pair, source in zip(pairs, sources, strict=True)]
     weights = hashlib.sha256(WEIGHTS.read_bytes()).hexdigest()
-    settings = tolerance | verdict | {"stride": stride, "unknown": unknown, "ending": ending, "weights": weights}
-
-    def run(number: int) -> ConfidenceSummary:
-        result = sources[number].results[0]
-        with fetched(pairs[number], (*READ, *ESTIMATES)) as files:
-            pair = read_pair(files)
-            given, other = (
-                None if path is None else _read(name, Path(path), files.est_scale, unknown)
-                for name, path in (("disparity_est", files.disparity_est), ("disparity1_est", files.disparity1_est))
-            )
-        found = confidence(given, pair.image0[None], pair.image1[None], other)
-        kept = found.keep(**verdict)[0, 0]
-        result.parent.mkdir(parents=True, exist_ok=True)
-        write_confidence(result, found.probability[0, 0].numpy())
-        return summarize_confidence(found, kept, pair.disparity_gt, **tolerance)
-
     folder: ResultFolder[ConfidenceSummary] = ResultFolder(
-        out, KIND, settings, to_json=asdict, from_json=lambda values: ConfidenceSummary(**values)
+        out,
+        KIND,
+        asdict(job) | {"ending": ending, "weights": weights},
+        to_json=asdict,
+        from_json=lambda values: ConfidenceSummary(**values),
+        shard=shard,
     )
     table = out / f"{KIND}.parquet"
 
@@ -124,9 +126,89 @@ def score_disparity_manifest(
         with whole_file(table) as part:
             write_table(confidence_frame(summaries, pairs), part)
 
+    def run(numbers: Sequence[int]) -> Iterator[tuple[int, ConfidenceSummary | Exception]]:
+        if num_workers == 1:
+            return in_turn(lambda number: _score(job, tasks[number]))(numbers)
+        return _in_parallel(job, {number: tasks[number] for number in numbers}, num_workers)
+
     worked = folder.work(sources, run, on_progress, write)
     frame = confidence_frame(worked.summaries, pairs)
-    return ManifestSummary(len(pairs), worked.num_found, worked.errors, frame, table)
+    num_pairs = len(range(shard[0] - 1, len(pairs), shard[1]))
+    return ManifestSummary(num_pairs, worked.num_found, worked.errors, frame, table)
+
+
+class _Task(NamedTuple):
+    """One map and the file of its probabilities."""
+
+    pair: PairFiles
+    result: Path
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What all maps share; names as in :func:`score_disparity_manifest`."""
+
+    unknown: float | None
+    max_error_px: float
+    max_error_share: float
+    stride: int
+    threshold: float | None
+    min_precision: float | None
+
+
+@cache
+def _network(job: _Job) -> DisparityConfidence:
+    return DisparityConfidence(job.max_error_px, job.max_error_share, job.stride)
+
+
+def _score(job: _Job, task: _Task) -> ConfidenceSummary:
+    """Write the probabilities of one map."""
+    with fetched(task.pair, (*READ, *ESTIMATES)) as files:
+        pair = read_pair(files)
+        given, other = (
+            None if path is None else _read(name, Path(path), files.est_scale, job.unknown)
+            for name, path in (("disparity_est", files.disparity_est), ("disparity1_est", files.disparity1_est))
+        )
+    found = _network(job)(given, pair.image0[None], pair.image1[None], other)
+    kept = found.keep(threshold=job.threshold, min_precision=job.min_precision)[0, 0]
+    task.result.parent.mkdir(parents=True, exist_ok=True)
+    write_confidence(task.result, found.probability[0, 0].numpy())
+    tolerance = {"max_error_px": job.max_error_px, "max_error_share": job.max_error_share}
+    return summarize_confidence(found, kept, pair.disparity_gt, **tolerance)
+
+
+def _score_in_worker(job: _Job, tasks: Sequence[_Task]) -> ConfidenceSummary | Exception:
+    """What becomes of one map, in a process with one thread."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    (task,) = tasks
+    try:
+        return _score(job, task)
+    except ONE_SOURCE_FAILS as error:
+        return error
+
+
+def _in_parallel(
+    job: _Job, tasks: Mapping[int, _Task], num_workers: int
+) -> Iterator[tuple[int, ConfidenceSummary | Exception]]:
+    """Maps as worker processes are done with them; one whose worker dies is not tried again."""
+    pool: WorkerPool[_Job, _Task, ConfidenceSummary | Exception] = WorkerPool(job, _score_in_worker, num_workers)
+    number_of = {task: number for number, task in tasks.items()}
+    waiting, num_open = iter(number_of), 0
+    try:
+        while True:
+            for task in islice(waiting, 2 * num_workers - num_open):
+                pool.submit([task])
+                num_open += 1
+            if not num_open:
+                return
+            for outcome in pool.collect(timeout_seconds=0.5):
+                num_open -= 1
+                (task,) = outcome.tasks
+                died = RuntimeError("the process that worked on it was killed; is there enough memory?")
+                yield number_of[task], died if outcome.result is None else outcome.result
+    finally:
+        pool.close()
 
 
 def _read(name: str, path: Path, scale: float | None, unknown: float | None) -> Tensor:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tensor_stereo.sweeps.results import read_errors as read_errors
     from tensor_stereo.sweeps.results import read_results as read_results
     from tensor_stereo.sweeps.run import run_sweep as run_sweep
+    from tensor_stereo.sweeps.stored_confidence import ConfidenceDataset as ConfidenceDataset
+    from tensor_stereo.sweeps.stored_confidence import StoredConfidence as StoredConfidence
     from tensor_stereo.sweeps.stored_matches import MatchDataset as MatchDataset
     from tensor_stereo.sweeps.stored_matches import StoredMatches as StoredMatches
     from tensor_stereo.sweeps.stored_matches import read_matches as read_matches
@@ -26,9 +28,11 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
+        "ConfidenceDataset": "stored_confidence",
         "MatchDataset": "stored_matches",
         "Plan": "plan",
         "RunInUseError": "journal",
+        "StoredConfidence": "stored_confidence",
         "StoredMatches": "stored_matches",
         "SweepError": "journal",
         "SweepProgress": "driver",

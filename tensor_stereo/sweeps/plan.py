@@ -14,6 +14,7 @@ from tensor_stereo.configs import SweepConfig
 from tensor_stereo.datasets.files import PairFiles
 from tensor_stereo.datasets.pair_table import PairTable
 from tensor_stereo.evaluation.rows import STAGES, stage_keys
+from tensor_stereo.result_folders import check_shard
 
 
 class Task(NamedTuple):
@@ -72,8 +73,7 @@ class Plan:
         Raises:
             ValueError: unless 1 <= index <= count.
         """
-        if not 1 <= index <= count:
-            raise ValueError(f"shard must be i/n with 1 <= i <= n, got {index}/{count}")
+        check_shard((index, count))
         size = len(self.groups)
         pairs = np.arange(index - 1, len(self.pairs), count, dtype=np.int64)
         return (pairs[:, None] * size + np.arange(size)).ravel()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
+from tensor_stereo.result_folders import check_shard
 from tensor_stereo.sweeps.batches import MATCHES_SCHEMA, METRICS_SCHEMA
 from tensor_stereo.sweeps.results import finished_parts, read_config, scan_parts
 from tensor_stereo.table_files import scan_parquet
@@ -73,8 +74,7 @@ class MatchDataset(IterableDataset[StoredMatches]):
         seed: int = 0,
         shard: tuple[int, int] = (1, 1),
     ) -> None:
-        if not 1 <= shard[0] <= shard[1]:
-            raise ValueError(f"shard must be (i, n) with 1 <= i <= n, got {shard}")
+        check_shard(shard)
         self.run, self.trial, self.shuffle, self.seed, self.shard = Path(run), trial, shuffle, seed, shard
         self.epoch = 0
         self.parts = finished_parts(run, "matches")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,18 +12,23 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from polars.testing import assert_frame_equal
+from torch.utils.data import DataLoader
 
 from tensor_stereo.cli import main
 from tensor_stereo.configs import SyntheticConfig
 from tensor_stereo.datasets import build_manifest, read_manifest, write_manifest, write_pfm
 from tensor_stereo.datasets.images import write_image
+from tensor_stereo.datasets.map_files import read_map
 from tensor_stereo.datasets.synthetic.rendering import render_pair
-from tensor_stereo.dense import match_semi_global
+from tensor_stereo.dense import match_semi_global, score_disparity
 from tensor_stereo.evaluation import sparsification_area
 from tensor_stereo.reports import confidence_folder
-from tensor_stereo.reports.confidence import RATES, score_disparity_files
+from tensor_stereo.reports.confidence import RATES, ConfidenceSummary, score_disparity_files
+from tensor_stereo.sweeps import ConfidenceDataset
 from tests.cli.failing import fails
 
+SCORE_IN_WORKER = confidence_folder._score_in_worker
 COLUMNS = "dataset,scene,image0,image1,disparity_est,disparity1_est,est_scale,disparity_gt\n"
 
 
@@ -161,7 +169,10 @@ def test_bad_manifests_are_one_line(listed: Path, tmp_path: Path, capsys: pytest
     fails([*command, *out, "--max-error-px", "0"], capsys, "--max-error-px")
     fails(["confidence", str(tmp_path / "left0.png")], capsys, "RIGHT", "manifest")
     alone = [str(tmp_path / name) for name in ("left0.png", "right0.png", "map0.pfm")]
-    fails(["confidence", *alone, "--ending", ".npy"], capsys, "--ending")
+    for option, value in (("--ending", ".npy"), ("--workers", "2"), ("--shard", "1/2")):
+        fails(["confidence", *alone, option, value], capsys, option, "without a manifest")
+    fails([*command, *out, "--workers", "0"], capsys, "--workers")
+    fails([*command, *out, "--shard", "3/2"], capsys, "--shard")
     text = listed.read_text()
     for wrong, words in (
         (text.replace("map2.pfm", ""), ("two/d", "disparity_est")),
@@ -177,3 +188,68 @@ def test_bad_manifests_are_one_line(listed: Path, tmp_path: Path, capsys: pytest
         main([*command, *out])
     assert stop.value.code == 1
     assert "one/a b: est_scale must be given" in capsys.readouterr().err
+
+
+def maps_of(out: Path) -> dict[str, bytes]:
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in out.rglob("*.npy")}
+
+
+def test_workers_and_shards_give_what_one_call_gives(listed: Path, tmp_path: Path) -> None:
+    alone = confidence_folder.score_disparity_manifest(listed, tmp_path / "one", ending=".npy", stride=4)
+    command = ["confidence", str(listed), "--ending", ".npy", "--stride", "4"]
+    main([*command, "--out", str(tmp_path / "two"), "--workers", "2"])
+    for shard in ("2/2", "1/2"):
+        main([*command, "--out", str(tmp_path / "three"), "--shard", shard])
+    whole = confidence_folder.score_disparity_manifest(listed, tmp_path / "three", ending=".npy", stride=4)
+    assert whole.num_found == 3
+    for out in (tmp_path / "two", tmp_path / "three"):
+        assert maps_of(out).keys() == maps_of(tmp_path / "one").keys()
+        for name in maps_of(out):
+            # another number of threads may add in another order
+            np.testing.assert_allclose(np.load(out / name), np.load(tmp_path / "one" / name), atol=1e-5)
+        frame = pl.read_parquet(out / "confidence.parquet")
+        assert_frame_equal(frame, alone.frame, abs_tol=1e-3)
+    again = confidence_folder.score_disparity_manifest(
+        listed, tmp_path / "three", ending=".npy", stride=4, shard=(1, 2)
+    )
+    assert (again.num_pairs, again.num_found, len(again.frame)) == (2, 2, 3)
+
+
+def die_at_c(job: confidence_folder._Job, tasks: Sequence[confidence_folder._Task]) -> ConfidenceSummary | Exception:
+    """A worker that is killed at one map."""
+    if tasks[0].pair.scene == "deep/c":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return SCORE_IN_WORKER(job, tasks)
+
+
+def test_a_worker_that_is_killed_costs_one_map(listed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(confidence_folder, "_score_in_worker", die_at_c)
+    first = confidence_folder.score_disparity_manifest(listed, tmp_path / "out", stride=4, num_workers=2)
+    assert list(first.errors) == ["two/deep/c"]
+    assert "was killed" in first.errors["two/deep/c"]
+    assert first.frame["scene"].to_list() == ["a b", "d"]
+    monkeypatch.undo()
+    rest = confidence_folder.score_disparity_manifest(listed, tmp_path / "out", stride=4, num_workers=2)
+    assert (rest.num_found, rest.errors) == (2, {})
+
+
+def test_what_is_kept_can_be_read_for_a_training(listed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    confidence_folder.score_disparity_manifest(listed, out, stride=2, shard=(1, 2))
+    data = ConfidenceDataset(listed, out)
+    assert len(data) == 2  # the second pair is of the other shard
+    loader = DataLoader(data, batch_size=None, num_workers=1, multiprocessing_context="spawn")
+    items = list(loader)
+    assert [(item.pair.dataset, item.pair.name) for item in items] == [("one", "a b"), ("two", "d")]
+    for item, (name, scale) in zip(items, (("map0.png", 256.0), ("map2.pfm", None)), strict=True):
+        np.testing.assert_array_equal(item.disparity.numpy(), read_map(tmp_path / name, scale=scale))
+        (expected,) = score_disparity(
+            item.disparity, item.pair.image0[None], item.pair.image1[None], stride=2
+        ).probability[0]
+        assert item.stride == 2
+        assert item.probability.shape == expected.shape
+        assert (item.probability - expected.nan_to_num(0)).abs().max() <= 0.5 / 65535 + 1e-5  # 16 bits; threads
+    with pytest.raises(IndexError, match="there are 2 maps, got number 2"):
+        data[2]
+    with pytest.raises(FileNotFoundError, match="holds no results"):
+        ConfidenceDataset(listed, tmp_path)

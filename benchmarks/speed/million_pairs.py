@@ -148,6 +148,15 @@ def main() -> None:
         sizes = {path.suffix: path.stat().st_size / 1e6 for path in (folder / "reported").glob("report.*")}
         highest = max(value for value, _ in reports)
         suite.note("report of four points", seconds=seconds, highest=highest, mb=mb, page_mb=sizes[".html"])
+        of_run = folder / "reported"
+        parts, journals = ([*of_run.glob(pattern)] for pattern in ("metrics/part-*.parquet", "journal-*.jsonl"))
+        suite.note(
+            "on disk, a million pairs at four points",
+            manifest_mb=Path(every).stat().st_size / 1e6,
+            journal_mb=sum(path.stat().st_size for path in journals) / 1e6,
+            metrics_mb=sum(path.stat().st_size for path in parts) / 1e6,
+            parts=len(parts),
+        )
     suite.write()
 
 

@@ -1,4 +1,4 @@
-"""Writes results/speed.md from what the suites of this folder wrote.
+"""Writes results/speed.md and results/sweep.md from what the suites of this folder wrote.
 
 python benchmarks/speed/report.py
 """
@@ -25,6 +25,13 @@ SUITES = {
     " 3108 px for every detector; the eight scenes one after the other.",
 }
 
+SWEEPS = {
+    "sweep": "By `speed/sweep.py`. FAST + `consensus` on rendered pairs of 400 x 300 px; one thread per worker. Plain"
+    " calls: the same units in a loop, without queue and run folder.",
+    "million_pairs": "By `speed/million_pairs.py`. Whole processes; memory is the most that the process of the sweep"
+    " held. `more_`: than an empty sweep.",
+}
+
 
 def tables(records: list[dict[str, Any]]) -> Iterator[str]:
     """Comparisons as tables, then the single figures."""
@@ -45,16 +52,21 @@ def tables(records: list[dict[str, Any]]) -> Iterator[str]:
             yield f"\n{record['title']}: {values}."
 
 
-def main() -> None:
+def write(name: str, title: str, suites: dict[str, str]) -> None:
     lines = [
-        "# Times and memory",
+        f"# {title}",
         "",
         "Two x86-64 cores with AVX-512; medians of the rounds of one run, in turns. Ratios are to the first row, with",
         "quartiles; ms are for orientation. Written by `speed/report.py`.",
     ]
-    for name, text in SUITES.items():
-        lines += ["", f"## {name}", "", text, *tables(read_records(name))]
-    (RESULTS / "speed.md").write_text("\n".join(lines) + "\n")
+    for suite, text in suites.items():
+        lines += ["", f"## {suite}", "", text, *tables(read_records(suite))]
+    (RESULTS / name).write_text("\n".join(lines) + "\n")
+
+
+def main() -> None:
+    write("speed.md", "Times and memory", SUITES)
+    write("sweep.md", "Sweeps", SWEEPS)
 
 
 if __name__ == "__main__":

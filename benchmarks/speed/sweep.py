@@ -1,4 +1,4 @@
-"""Sweeps: engines and workers against plain calls in one process, memory of a worker, resuming."""
+"""Sweeps: engines and workers against plain calls in one process, memory over time, resuming, units without work."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ SETTINGS = {"detector": "fast", "verdict": "cardinality", "score": "consensus"}
 CONFIG = SweepConfig((TrialConfig(**SETTINGS),))
 NUM_UNITS = 3000  # more than a minute on one worker
 ROUNDS = 2
+NUM_TRIVIAL = 100_000
 
 
 def repeat(manifest: pl.DataFrame, count: int, path: Path) -> Path:
@@ -47,23 +48,23 @@ def repeat(manifest: pl.DataFrame, count: int, path: Path) -> Path:
     return path
 
 
-def peak_mb() -> float:
-    """Largest resident memory that a child process has had."""
-    peaks = [0.0]
-    for child in active_children():
-        with contextlib.suppress(OSError):  # it has just ended
-            status = Path(f"/proc/{child.pid}/status").read_text()
-            peaks += [int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")]
-    return max(peaks)
+def resident_mb(pid: int | None) -> float:
+    """Resident memory of a process; 0 of one that has just ended."""
+    with contextlib.suppress(OSError):
+        status = Path(f"/proc/{pid}/status").read_text()
+        return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")), 0.0)
+    return 0.0
 
 
-def timed_sweep(manifest: Path, folder: Path, watch: Callable[[], None] = lambda: None, **options: object) -> float:
+def timed_sweep(
+    manifest: Path, folder: Path, watch: Callable[[SweepProgress], None] = lambda _: None, **options: object
+) -> float:
     """Seconds per unit of a new run, from the first report of progress on: workers are warm then."""
     seen: list[tuple[float, int]] = []
 
     def report(state: SweepProgress) -> None:
         seen.append((time.perf_counter(), state.num_new))
-        watch()
+        watch(state)
 
     out = folder / "run"
     shutil.rmtree(out, ignore_errors=True)
@@ -89,17 +90,17 @@ def trivial(_: SweepConfig, tasks: Sequence[Task]) -> BatchResult:
     return make_batch([row | {"unit": task.unit, "scene": task.files.scene} for task in tasks])
 
 
-def driver_rate(manifest: Path, folder: Path, count: int) -> float:
-    """Units per second of ``count`` that do nothing, through Ray, the driver and the run folder."""
+def driver_rate(manifest: Path, folder: Path) -> float:
+    """Units per second that do nothing, through Ray, the driver and the run folder, with the start of Ray."""
     pairs = PairTable(manifest, check_files=False)
     plan = build_plan(CONFIG, pairs)
-    units = plan.shard(1, 1)[:count]
+    units = plan.shard(1, 1)
     record = {"format": FORMAT, "sweep": asdict(CONFIG), "manifest": {"num_pairs": len(pairs)}}
     engine = RayEngine(CONFIG, 2, run=trivial)
     start = time.perf_counter()
     with RunStore(folder / "trivial", record, pairs) as store:
         drive(engine, plan, store, units, units)
-    return count / (time.perf_counter() - start)
+    return len(units) / (time.perf_counter() - start)
 
 
 def main() -> None:
@@ -126,18 +127,23 @@ def main() -> None:
         ):
             ratios = [a / b for a, b in zip(seconds[above], seconds[below], strict=True)]
             suite.note(title, ratio=statistics.median(ratios), lowest=min(ratios), highest=max(ratios))
-        peaks = {}
-        for count in (NUM_UNITS // 10, NUM_UNITS):
-            seen = [0.0]
-            few = repeat(rendered, count, folder / "few.parquet")
-            timed_sweep(few, folder, lambda seen=seen: seen.append(peak_mb()), num_workers=1)
-            peaks[count] = max(seen)
-        suite.note("peak memory of a worker in MB", **{f"{count} pairs": peak for count, peak in peaks.items()})
+        seen: list[tuple[float, float, float]] = []
+
+        def watch(state: SweepProgress) -> None:
+            workers = [resident_mb(child.pid) for child in active_children()]
+            seen.append((state.num_new / NUM_UNITS, resident_mb(os.getpid()), max(workers, default=0.0)))
+
+        timed_sweep(manifest, folder, watch, num_workers=2)
+        for share in (0.1, 0.5, 0.9):
+            _, driver, worker = min(seen, key=lambda entry: abs(entry[0] - share))
+            suite.note(f"resident memory at {share:.0%} of the units, MB", driver=driver, worker=worker)
+        trivial_units = repeat(rendered, NUM_TRIVIAL, folder / "trivial.parquet")
+        suite.note("units without work through Ray and the run folder", per_second=driver_rate(trivial_units, folder))
         many = repeat(rendered, 10_000, folder / "many.parquet")
         shutil.rmtree(folder / "run")
         run_sweep(CONFIG, many, folder / "run", limit=0)
         known = json.loads((folder / "run" / "config.json").read_text())
-        row = dict.fromkeys(METRICS_SCHEMA) | {"trial": 0}
+        row = dict.fromkeys(METRICS_SCHEMA) | {"trial": 0, "num_valid": 1}
         with RunStore(folder / "run", known, PairTable(many, check_files=False)) as store:
             for first in range(0, 10_000, 100):
                 store.add(make_batch([row | {"unit": unit} for unit in range(first, first + 100)]))

@@ -2,14 +2,17 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 
 from tensor_stereo.configs import TrialConfig
 from tensor_stereo.evaluation.rows import ROW_SCHEMA, SCORE_BINS, STAGES, setting_columns
+from tensor_stereo.reports.sweep import rows as rows_module
 from tensor_stereo.reports.sweep.curves import detector_curves
 from tensor_stereo.reports.sweep.pooling import (
     best_trials,
@@ -265,3 +268,28 @@ def test_rectified_tells_trials_apart() -> None:
 def test_rectified_follows_from_a_score_that_does_not_ask() -> None:
     results = make_results(make_grid(("fast",), scores=("learned", "topology"), outlier_rates=(0.0,)), num_pairs=1)
     assert "rectified" not in varying_settings([trials_of(results)])
+
+
+def test_sums_do_not_depend_on_how_the_rows_lie(
+    results: pl.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one frame, or in files of a few rows in another order that are read a few rows at a time."""
+    settings = results.select("trial", *SETTINGS).unique()
+    rows = results.drop(SETTINGS).sample(fraction=1, shuffle=True, seed=1)
+    for k, part in enumerate(rows.iter_slices(37)):
+        part.write_parquet(tmp_path / f"part-{k}.parquet")
+    monkeypatch.setattr(rows_module, "_BATCH", 5)
+    whole, parts = RunRows.of(results), RunRows.of(pl.scan_parquet(tmp_path / "*.parquet"), settings)
+    hosts = pl.col("hosts").list.sort()
+    assert_frame_equal(parts.trials.with_columns(hosts), whole.trials.with_columns(hosts), check_exact=True)
+    assert len(parts) == len(whole) == len(results)
+    assert_frame_equal(parts.head(50), whole.head(50), check_column_order=False)
+    assert worst_pairs(parts, 2).select("unit", "trial").equals(worst_pairs(whole, 2).select("unit", "trial"))
+
+
+def test_rows_that_cannot_be_read_are_an_error(results: pl.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader that ends early must not go for a shorter run."""
+    some = results.select("trial", "score_counts_correct", "score_counts_incorrect").head(7)
+    monkeypatch.setattr(pl.LazyFrame, "collect_batches", lambda *_, **__: iter([some]))
+    with pytest.raises(OSError, match=f"only 7 of {len(results)} rows can be decoded"):
+        RunRows.of(results)

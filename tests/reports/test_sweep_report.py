@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from tensor_stereo.reports.figures import draw_matches
-from tensor_stereo.reports.sweep import data_tables
+from tensor_stereo.reports.sweep import data_tables, summary
 from tensor_stereo.reports.sweep.data_tables import Column, script_json
 from tensor_stereo.reports.sweep.overlays import draw_overlay
 from tensor_stereo.reports.sweep.pooling import pool_trials
@@ -140,6 +140,20 @@ def test_a_page_of_too_many_rows_says_so(
     assert f"The first 20 of {len(results)} rows" in "".join(page.inside("p"))
     both, _ = render([run, run], tmp_path)
     assert cells(both.data()["pairs"])[0] == ["A"] * 10 + ["B"] * 10
+
+
+def test_of_many_failures_the_first_are_shown_and_all_are_counted(
+    results: pl.DataFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (data_tables, summary):
+        monkeypatch.setattr(module, "MAX_FAILURES", 3)
+    run = make_run("run", results, num_errors=7)
+    page, markdown = render([replace(run, errors=run.errors.reverse())], tmp_path)
+    assert cells(page.data()["failures"])[1] == ["frame_9000", "frame_9001", "frame_9002"]
+    assert "The first 3 of 7 rows" in "".join(page.inside("p"))
+    assert "the first 3 of 7 failed units" in markdown
+    counted = [re.sub(r"\s+", " ", line) for line in markdown.splitlines()]
+    assert {"| read | ValueError | 4 |", "| detect | MemoryError | 3 |"} <= set(counted)
 
 
 def test_nothing_in_the_data_becomes_markup(results: pl.DataFrame, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,13 +31,21 @@ from experiments.guided_network import NUM_STEPS, GuidedStereoNet, double, halve
 from training.scenes import NUM_FOLDS, Views, list_scenes, read_views
 
 SEEDS = range(5)
-STEPS, CROPS_AT_ONCE, CROP = 1500, 4, (256, 384)  # px of the full image
-LEARNING_RATE = 2e-3
 VALIDATION_FOLD = NUM_FOLDS - 1  # of KITTI's drives
 NUM_SYNTHETIC = 24
 NO_HINTS = 1 / 3  # share of the crops
 DENSITY = (1e-3, 5e-2)  # least and most share of the pixels that are hints, where there are any
 HINT_NOISE_PX = 0.5
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Settings of a training; lengths in px of the full images."""
+
+    steps: int = 1000
+    crops_at_once: int = 4
+    crop: tuple[int, int] = (256, 384)
+    learning_rate: float = 2e-3
 
 
 def read_training(data: Path, more: Path) -> list[Views]:
@@ -49,11 +58,11 @@ def read_training(data: Path, more: Path) -> list[Views]:
     return found
 
 
-def crop(views: Views, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def draw_crop(views: Views, size: tuple[int, int], rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Both images (1, h, w) uint8, truth (h, w), hints (h, w), upside down in half the cases; padded with nothing."""
     height, width = views.image0.shape
-    top, left = (int(rng.integers(0, max(n - c, 0) + 1)) for n, c in zip((height, width), CROP, strict=True))
-    part = slice(top, top + CROP[0]), slice(left, left + CROP[1])
+    top, left = (int(rng.integers(0, max(n - c, 0) + 1)) for n, c in zip((height, width), size, strict=True))
+    part = slice(top, top + size[0]), slice(left, left + size[1])
     images = [views.image0[part], views.image1[part]]
     truth = np.where(np.isfinite(views.disparity0[part]), views.disparity0[part], np.nan).astype(np.float32)
     columns = np.arange(truth.shape[1])
@@ -61,7 +70,7 @@ def crop(views: Views, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor
     if rng.random() < 0.5:
         images, truth = [image[::-1] for image in images], truth[::-1]
     hints = draw_hints(truth, rng)
-    pad = ((0, CROP[0] - truth.shape[0]), (0, CROP[1] - truth.shape[1]))
+    pad = ((0, size[0] - truth.shape[0]), (0, size[1] - truth.shape[1]))
     truth, hints = (np.pad(values, pad, constant_values=np.nan) for values in (truth, hints))
     left_view, right_view = (torch.from_numpy(np.pad(image, pad, mode="edge")[None].copy()) for image in images)
     return left_view, right_view, torch.from_numpy(truth), torch.from_numpy(hints)
@@ -82,14 +91,15 @@ def loss_of(disparity: Tensor, truth: Tensor) -> Tensor:
     return (distance.flatten(1).sum(1) / count).sum() / count.sum()
 
 
-def train(scenes: Sequence[Views], seed: int) -> GuidedStereoNet:
+def train(scenes: Sequence[Views], seed: int, config: TrainingConfig) -> GuidedStereoNet:
+    """Weights, scenes, crops and hints follow from the seed alone."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     net = GuidedStereoNet().to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(net.parameters(), LEARNING_RATE, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, STEPS, pct_start=0.15)
-    for step in range(STEPS):
-        parts = [crop(scenes[k], rng) for k in rng.integers(0, len(scenes), CROPS_AT_ONCE)]
+    optimizer = torch.optim.AdamW(net.parameters(), config.learning_rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.learning_rate, config.steps, pct_start=0.15)
+    for step in range(config.steps):
+        parts = [draw_crop(scenes[k], config.crop, rng) for k in rng.integers(0, len(scenes), config.crops_at_once)]
         left, right, truth, hints = (torch.stack(column) for column in zip(*parts, strict=True))
         image0, image1 = (torch.stack([halve(view) for view in views]) for views in (left, right))
         with torch.autocast("cpu", torch.bfloat16):
@@ -111,7 +121,7 @@ def train_to(data: Path, more: Path, work: Path, seed: int) -> None:
     cv2.setNumThreads(1)
     path, start = weights_path(work, seed), time.perf_counter()
     if not path.exists():
-        save_file(train(read_training(data, more), seed).state_dict(), path)
+        save_file(train(read_training(data, more), seed, TrainingConfig()).state_dict(), path)
         print(f"{path}: {time.perf_counter() - start:.0f} s", flush=True)
 
 

@@ -83,7 +83,7 @@ def fitted_planes(left: Gray, right: Gray, count: int, *, costs: Costs) -> Float
 _SGBM = partial(semi_global, block=5, small=200, large=800)
 _3WAY, _HH = cv2.STEREO_SGBM_MODE_SGBM_3WAY, cv2.STEREO_SGBM_MODE_HH
 _CENSUS, _LEVELS = (partial(classic_costs, kind=kind) for kind in (0, 1))
-_CLASSIC: dict[str, Method] = {
+CLASSIC: dict[str, Method] = {
     "sgbm": partial(_SGBM, mode=cv2.STEREO_SGBM_MODE_SGBM, cleaned=False),
     "sgbm, cleaned": partial(_SGBM, mode=cv2.STEREO_SGBM_MODE_SGBM, cleaned=True),
     "sgbm, 3way": partial(semi_global, block=3, small=72, large=288, mode=_3WAY, cleaned=False),
@@ -98,14 +98,14 @@ _CLASSIC: dict[str, Method] = {
 }
 ALTERED = "altered"  # truth, for training only
 _FAMILIES = {"census": "wta", "levels": "wta", "network": "network", "filled": "filled", "planes": "filled"}
-METHODS = (*_CLASSIC, "network", "network, guided")
+METHODS = (*CLASSIC, "network", "network, guided")
 FAMILIES = ("sgbm", "bm", *dict.fromkeys(_FAMILIES.values()), ALTERED)
 
 
 def make_methods(network: MatchingNetwork) -> dict[str, Method]:
     """All of ``METHODS``, those of a matching network too."""
     costs = partial(matching_costs, network)
-    return _CLASSIC | {
+    return CLASSIC | {
         "network": partial(winners, costs=costs),
         "network, guided": partial(guided_winners, costs=costs),
     }

@@ -37,9 +37,10 @@ def whole_file(path: Path) -> Iterator[Path]:
     ...     [entry.name for entry in Path(folder).iterdir()]
     ['a.txt']
     """
-    part = path.with_name(f".{os.getpid()}.{path.name}")
+    own = f"{os.getpid()}-{os.urandom(4).hex()}"  # two nodes, or containers, may have processes of one number
+    part = path.with_name(f".{own}.{path.name}")
     if len(os.fsencode(part.name)) > _MAX_NAME_BYTES:
-        part = path.with_name(f".{os.getpid()}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()}{path.suffix}")
+        part = path.with_name(f".{own}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()}{path.suffix}")
     try:
         yield part
         with part.open("r+b") as file:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Generic, NamedTuple, TypeVar
@@ -16,8 +17,9 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 ONE_SOURCE_FAILS = (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError)
 
 Summary = TypeVar("Summary")
-Run = Callable[[Sequence[int]], Iterator[tuple[int, Summary | Exception]]]
-"""Makes the results of some sources, by their numbers, and tells of each, in any order, or why there is none."""
+Run = Callable[[Iterable[int]], Iterator[tuple[int, Summary | Exception]]]
+"""Makes the results of some sources, by their numbers, and tells of each, in any order, or why there is none. It takes
+a number when it is about to read the source."""
 
 
 class Source(NamedTuple):
@@ -64,7 +66,7 @@ def in_turn(make: Callable[[int], Summary]) -> Run[Summary]:
     [(2, 5), (5, 2)]
     """
 
-    def run(numbers: Sequence[int]) -> Iterator[tuple[int, Summary | Exception]]:
+    def run(numbers: Iterable[int]) -> Iterator[tuple[int, Summary | Exception]]:
         for number in numbers:
             outcome: Summary | Exception
             try:
@@ -132,18 +134,15 @@ class ResultFolder(Generic[Summary]):
             OSError: If nothing can be written to it.
         """
         worked: Worked[Summary] = Worked()
-        with self.journal_file.open("ab", buffering=0) as journal:
-            if not lock(journal):
-                raise ValueError(f"out: another call works on {self.out}; wait for it or name another folder")
-            self._claim()
+        with self._claim() as journal:
             drop_torn_line(journal, self.journal_file)
             try:
                 num_found = self._work(sources, run, on_progress, journal, worked)
             finally:
-                known = self._find(sources) | worked.summaries
-                summaries = {source.name: known[source.name] for source in sources if source.name in known}
-                if on_end is not None:
-                    on_end(summaries)
+                with self._locked():
+                    summaries = self._told(sources, worked)
+                    if on_end is not None:
+                        on_end(summaries)
         return Worked(num_found, worked.errors, summaries)
 
     def _work(
@@ -156,8 +155,7 @@ class ResultFolder(Generic[Summary]):
     ) -> int:
         """Fill ``worked``; how many sources were done before."""
         mine = range(self.shard[0] - 1, len(sources), self.shard[1])
-        stamps = {number: _stamp(sources[number]) for number in mine}
-        known, found = self._read_journals(), self._find(sources)
+        known = read_entries(self.out, self.kind)
         num_done = 0
 
         def tell(name: str) -> None:
@@ -166,40 +164,88 @@ class ResultFolder(Generic[Summary]):
             if on_progress is not None:
                 on_progress(num_done, len(mine), name)
 
-        todo = [number for number in mine if sources[number].name not in found]
-        num_found = len(mine) - len(todo)
+        todo = []
         for number in mine:
-            if sources[number].name in found:
-                tell(sources[number].name)
-        for number, outcome in run(todo):
-            source, stamp = sources[number], stamps[number]
+            source = sources[number]
+            summary = self._read(find_entry(source, known))
+            if summary is None:
+                todo.append(number)
+            else:
+                worked.summaries[source.name] = summary
+                tell(source.name)
+        stamps: dict[int, list[Any]] = {}
+
+        def begin() -> Iterator[int]:
+            for number in todo:
+                stamps[number] = _stamp(sources[number])
+                yield number
+
+        for number, outcome in run(begin()):
+            source, stamp = sources[number], stamps.pop(number)
             if isinstance(outcome, Exception):
                 if isinstance(outcome, OSError) and outcome.errno in _NO_ROOM:
                     raise outcome
                 worked.errors[source.name] = " ".join(str(outcome).split())
-                entries = known.get(source.name, [])
-                if entries and stamp and all(stamp != entry["stamp"] for entry in entries):  # of what the source was
+                last = known.get(source.name)
+                if last and stamp and stamp != last[-1]["stamp"]:  # the result is of what the source was
                     for path in source.results:
                         path.unlink(missing_ok=True)
             else:
                 worked.summaries[source.name] = outcome
-                done = {"name": source.name, "stamp": stamp, "size": _sizes(source.results)}
-                line = json.dumps(done | {"summary": self._to_json(outcome)}, separators=(",", ":"))
-                append_line(line.encode(), journal)
+                if stamp or not source.inputs:  # else a file has come since, and who knows when
+                    done = {"name": source.name, "stamp": stamp} | _state(source.results)
+                    line = json.dumps(done | {"summary": self._to_json(outcome)}, separators=(",", ":"))
+                    append_line(line.encode(), journal)
             tell(source.name)
-        return num_found
+        return len(mine) - len(todo)
 
-    def _find(self, sources: Sequence[Source]) -> dict[str, Summary]:
-        """What is told of each source that is done, and has not changed since."""
-        known, found = self._read_journals(), {}
+    def _told(self, sources: Sequence[Source], worked: Worked[Summary]) -> dict[str, Summary]:
+        """What is told of every source, in their order: here, and by the journals of the other shards."""
+        known = read_entries(self.out, self.kind) if self.shard != (1, 1) else {}
+        mine = {source.name for source in sources[self.shard[0] - 1 :: self.shard[1]]}
+        found = {}
         for source in sources:
-            state = _stamp(source), _sizes(source.results)
-            for entry in known.get(source.name, []):
-                if (entry["stamp"], entry["size"]) == state:
-                    found[source.name] = self._from_json(entry["summary"])
+            if source.name in worked.summaries:
+                found[source.name] = worked.summaries[source.name]
+            elif source.name not in mine and source.name in known:
+                summary = self._read(known[source.name][-1])
+                if summary is not None:
+                    found[source.name] = summary
         return found
 
-    def _claim(self) -> None:
+    def _read(self, entry: dict[str, Any] | None) -> Summary | None:
+        """What an entry tells; None without one, or of one that another release has written."""
+        if entry is None:
+            return None
+        try:
+            return self._from_json(entry["summary"])
+        except (ValueError, TypeError, KeyError):
+            return None
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Wait for, and hold, the folder for the moment of a change that all shards share."""
+        with (self.out / f".{self.kind}.lock").open("w") as file:
+            lock(file, wait=True)
+            yield
+
+    @contextmanager
+    def _claim(self) -> Iterator[IO[bytes]]:
+        """The journal of this shard, locked; raise if another call has it, or divides the work in another way."""
+        with self.journal_file.open("ab", buffering=0) as journal:
+            with self._locked():
+                if not lock(journal) or any(_is_held(path) for path in self._other_divisions()):
+                    raise ValueError(f"out: another call works on {self.out}; wait for it or name another folder")
+                self._claim_settings()
+            yield journal
+
+    def _other_divisions(self) -> list[Path]:
+        """Journals of shards of another number of shards."""
+        same = f"{self.kind}-*-of-{self.shard[1]}.jsonl"
+        others = set(_journals(self.out, self.kind)) - {self.journal_file}
+        return sorted(others if self.shard == (1, 1) else others - set(self.out.glob(same)))
+
+    def _claim_settings(self) -> None:
         """Make this the folder of the settings, or raise if it is that of others."""
         path = self.settings_file
         if path.exists():
@@ -215,27 +261,54 @@ class ResultFolder(Generic[Summary]):
         with whole_file(path) as part:
             part.write_text(json.dumps(self.settings, indent=1) + "\n", encoding="utf-8")
 
-    def _read_journals(self) -> dict[str, list[dict[str, Any]]]:
-        """All entries of each source; a line that the end of its process has torn does not count."""
-        entries: dict[str, list[dict[str, Any]]] = {}
-        journals = sorted({*self.out.glob(f"{self.kind}-*-of-*.jsonl"), self.out / f"{self.kind}.jsonl"})
-        lines = [line for path in journals if path.exists() for line in path.read_bytes().splitlines()]
-        for line in lines:
+
+def read_entries(out: Path, kind: str) -> dict[str, list[dict[str, Any]]]:
+    """All entries of each source that the journals of a folder hold, the one of the newest result last.
+
+    A line that the end of its process has torn does not count.
+    """
+    entries: dict[str, list[dict[str, Any]]] = {}
+    for path in _journals(out, kind):
+        for line in path.read_bytes().splitlines():
             try:
-                entry = json.loads(line)
-                self._from_json(entry["summary"])
-                entries.setdefault(entry["name"], []).append({"stamp": None, "size": None} | entry)
+                entry = {"stamp": None, "size": None, "written": []} | json.loads(line)
+                if isinstance(entry["summary"], dict):
+                    entries.setdefault(entry["name"], []).append(entry)
             except (ValueError, TypeError, KeyError):
                 continue
-        return entries
+    for found in entries.values():
+        found.sort(key=lambda entry: entry["written"])  # those of earlier releases have none, and stay in their order
+    return entries
 
 
-def _sizes(paths: Sequence[Path]) -> int | list[int] | None:
-    """Bytes of the first result, or of all if others are there too; None if the first is not there."""
-    if not paths[0].is_file():
+def find_entry(source: Source, entries: dict[str, list[dict[str, Any]]]) -> dict[str, Any] | None:
+    """The entry of a source that is done and has not changed since; only the last one can speak of what is there."""
+    found = entries.get(source.name)
+    if not found or (source.inputs and not found[-1]["stamp"]) or found[-1]["stamp"] != _stamp(source):
         return None
-    sizes = [path.stat().st_size for path in paths if path.is_file()]
-    return sizes if len(sizes) > 1 else sizes[0]
+    state = _state(source.results)
+    is_there = found[-1]["size"] == state["size"] and found[-1]["written"] in ([], state["written"])
+    return found[-1] if is_there else None
+
+
+def _journals(out: Path, kind: str) -> list[Path]:
+    whole = out / f"{kind}.jsonl"
+    return sorted(out.glob(f"{kind}-*-of-*.jsonl")) + [whole] * whole.exists()
+
+
+def _is_held(path: Path) -> bool:
+    """Whether another process works on a shard."""
+    with path.open("r+") as file:
+        return not lock(file)
+
+
+def _state(paths: Sequence[Path]) -> dict[str, Any]:
+    """Bytes of the first result, or of all if others are there too, and when they were written; None without it."""
+    if not paths[0].is_file():
+        return {"size": None, "written": []}
+    states = [path.stat() for path in paths if path.is_file()]
+    sizes = [state.st_size for state in states]
+    return {"size": sizes if len(sizes) > 1 else sizes[0], "written": [state.st_mtime_ns for state in states]}
 
 
 def _stamp(source: Source) -> list[Any]:

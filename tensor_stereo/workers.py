@@ -85,7 +85,7 @@ class WorkerPool(Generic[State, Task, Result]):
     def submit(self, tasks: Sequence[Task]) -> None:
         """Queue a batch."""
         self._waiting.append(tuple(tasks))
-        while len(self._workers) < self.num_workers:
+        if len(self._workers) < self.num_workers:
             self._start_worker()
         self._dispatch()
 
@@ -101,7 +101,7 @@ class WorkerPool(Generic[State, Task, Result]):
             worker = self._workers[connection]
             try:
                 message = connection.recv()
-            except (EOFError, OSError):  # also in the middle of a message
+            except Exception:
                 self._bury(connection)
                 if not worker.has_begun:
                     raise WorkerStartError from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -57,8 +58,9 @@ class Anchors(NamedTuple):
         return hints
 
 
+@torch.no_grad()
 def find_anchors(pair: GrayPair, network: LearnedScore, *, gated: bool) -> dict[str, Anchors]:
-    """FAST corners matched by SSD, and what each condition keeps of them.
+    """FAST corners matched by SSD, and what each condition keeps of them; GMS where OpenCV has it.
 
     Thresholds are those that ``accuracy/dense.py`` chose on the training scenes; a calibrated probability is taken at
     its word, .5.
@@ -68,19 +70,20 @@ def find_anchors(pair: GrayPair, network: LearnedScore, *, gated: bool) -> dict[
     kept = {
         "all putatives": np.ones(len(given.points0), bool),
         "paper R1+R2": scores["paper R1+R2"] > 0,
-        "GMS": score_gms(given) > 0,
         "left-right check": is_mutual(given, find_putatives(turned(pair), "fast", gated=gated), pair.left.shape[1]),
         MEDIAN: scores[MEDIAN] >= median_threshold(gated=gated),
         "consensus": scores["consensus"] >= LIKELY,
         "learned": scores["learned"] >= LIKELY,
         "oracle": given.correct & given.valid,
     }
+    if hasattr(cv2, "xfeatures2d"):  # of opencv-contrib
+        kept["GMS"] = score_gms(given) > 0
     every = Anchors(
         np.rint(given.points0).astype(np.int64), (given.points0 - given.points1)[:, 0], given.correct | ~given.valid
     )
     found = {name: every.some(rows) for name, rows in kept.items()}
     found["learned + repair"] = repaired(pair, given, network)
-    return {name: found[name] for name in CONDITIONS}
+    return {name: found[name] for name in CONDITIONS if name in found}
 
 
 def repaired(pair: GrayPair, given: Putatives, network: LearnedScore) -> Anchors:

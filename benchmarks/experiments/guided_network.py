@@ -20,7 +20,7 @@ _MULTIPLE = 8  # of which the sides of halved images must be
 
 
 class GuidedStereoNet(nn.Module):
-    """Disparities from two halved grey images and hints; 430 000 weights."""
+    """Disparities from two halved grey images and hints; 400 000 weights."""
 
     def __init__(self, feature_width: int = 24, width: int = 64) -> None:
         super().__init__()

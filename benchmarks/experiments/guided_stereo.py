@@ -124,7 +124,7 @@ def report(suite: Suite, putatives: str, group: str, cases: list[Case], judged: 
         text = "  ".join(f"{key} {record[key]:.4f}" for key in ("bad", "bad_spread", "epe_px", "correct"))
         print(f"  {name:40} {record['hints']:7.0f}  {text}", flush=True)
     for ending in ("", ", equal"):
-        of = {name: bad[name + ending] for name in CONDITIONS}
+        of = {name: bad[name + ending] for name in CONDITIONS if name in bad}
         gap = of["all putatives"] - of["oracle"]
         power = float(gap.mean() / gap.std(ddof=1))
         closed = {name: share_of_gap(of, name) for name in ("learned", "learned + repair", "consensus")}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -16,21 +18,20 @@ import torch
 from torch import Tensor
 
 from tensor_stereo.atomic import whole_file
-from tensor_stereo.datasets.files import ESTIMATES, PATHS, READ, PairFiles
+from tensor_stereo.datasets.files import ESTIMATES, READ, PairFiles
 from tensor_stereo.datasets.manifest import read_manifest
 from tensor_stereo.datasets.map_files import read_map, write_confidence
-from tensor_stereo.datasets.pair_table import pair_row
 from tensor_stereo.datasets.pairs import read_pair
-from tensor_stereo.datasets.remote import fetched, local_paths
+from tensor_stereo.datasets.remote import fetched
 from tensor_stereo.dense.confidence import WEIGHTS, DisparityConfidence, check_verdict
 from tensor_stereo.paths import MAPS, TABLES, check_ending, check_source, prepare_folder
 from tensor_stereo.reports.confidence import RATES, ConfidenceSummary, summarize_confidence
 from tensor_stereo.reports.tables import Table
 from tensor_stereo.result_folders import ONE_SOURCE_FAILS, ResultFolder, Source, check_shard, in_turn
+from tensor_stereo.sweeps.stored_confidence import KIND, map_source
 from tensor_stereo.table_files import write_table
 from tensor_stereo.workers import WorkerPool
 
-KIND = "confidence"  # of the results: confidence.json, confidence.jsonl, confidence.parquet
 _SHOWN = ("bad", "bad_kept", "epe_px", "epe_px_kept", "sparsification", "sparsification_optimum")
 
 
@@ -126,11 +127,8 @@ def score_disparity_manifest(
         with whole_file(table) as part:
             write_table(confidence_frame(summaries, pairs), part)
 
-    def run(numbers: Sequence[int]) -> Iterator[tuple[int, ConfidenceSummary | Exception]]:
-        if num_workers == 1:
-            return in_turn(lambda number: _score(job, tasks[number]))(numbers)
-        return _in_parallel(job, {number: tasks[number] for number in numbers}, num_workers)
-
+    alone = in_turn(lambda number: _score(job, tasks[number]))
+    run = alone if num_workers == 1 else partial(_in_parallel, job, tasks, num_workers)
     worked = folder.work(sources, run, on_progress, write)
     frame = confidence_frame(worked.summaries, pairs)
     num_pairs = len(range(shard[0] - 1, len(pairs), shard[1]))
@@ -177,7 +175,21 @@ def _score(job: _Job, task: _Task) -> ConfidenceSummary:
     return summarize_confidence(found, kept, pair.disparity_gt, **tolerance)
 
 
-def _score_in_worker(job: _Job, tasks: Sequence[_Task]) -> ConfidenceSummary | Exception:
+class _Failure(NamedTuple):
+    """Why there is no result, as it comes from another process; ``errno`` is that of an ``OSError``.
+
+    ``trace`` is set for what is no fault of the files.
+    """
+
+    text: str
+    errno: int | None = None
+    trace: str = ""
+
+    def to_error(self) -> Exception:
+        return RuntimeError(self.text) if self.errno is None else OSError(self.errno, self.text)
+
+
+def _score_in_worker(job: _Job, tasks: Sequence[_Task]) -> ConfidenceSummary | _Failure:
     """What becomes of one map, in a process with one thread."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -185,30 +197,44 @@ def _score_in_worker(job: _Job, tasks: Sequence[_Task]) -> ConfidenceSummary | E
     try:
         return _score(job, task)
     except ONE_SOURCE_FAILS as error:
-        return error
+        return _Failure(str(error), error.errno if isinstance(error, OSError) else None)
+    except Exception as error:
+        return _Failure(str(error), trace=traceback.format_exc())
 
 
 def _in_parallel(
-    job: _Job, tasks: Mapping[int, _Task], num_workers: int
+    job: _Job, tasks: Sequence[_Task], num_workers: int, numbers: Iterable[int]
 ) -> Iterator[tuple[int, ConfidenceSummary | Exception]]:
     """Maps as worker processes are done with them; one whose worker dies is not tried again."""
-    pool: WorkerPool[_Job, _Task, ConfidenceSummary | Exception] = WorkerPool(job, _score_in_worker, num_workers)
-    number_of = {task: number for number, task in tasks.items()}
-    waiting, num_open = iter(number_of), 0
+    pool: WorkerPool[_Job, _Task, ConfidenceSummary | _Failure] = WorkerPool(job, _score_in_worker, num_workers)
+    at_work: dict[_Task, int] = {}
+    waiting = iter(numbers)
     try:
         while True:
-            for task in islice(waiting, 2 * num_workers - num_open):
-                pool.submit([task])
-                num_open += 1
-            if not num_open:
+            for number in islice(waiting, 2 * num_workers - len(at_work)):
+                at_work[tasks[number]] = number
+                pool.submit([tasks[number]])
+            if not at_work:
                 return
             for outcome in pool.collect(timeout_seconds=0.5):
-                num_open -= 1
                 (task,) = outcome.tasks
-                died = RuntimeError("the process that worked on it was killed; is there enough memory?")
-                yield number_of[task], died if outcome.result is None else outcome.result
+                found = outcome.result
+                if found is None:
+                    _drop_parts(task.result)
+                    found = _Failure("the process that worked on it was killed; is there enough memory?")
+                if isinstance(found, _Failure) and found.trace:
+                    raise RuntimeError(f"{task.pair.dataset}/{task.pair.scene}: a worker raised\n{found.trace}")
+                yield at_work.pop(task), found.to_error() if isinstance(found, _Failure) else found
     finally:
         pool.close()
+        for task in at_work:
+            _drop_parts(task.result)
+
+
+def _drop_parts(result: Path) -> None:
+    """Remove what a process that was killed has left of a file."""
+    for part in result.parent.glob(f".*.{glob.escape(result.name)}"):
+        part.unlink(missing_ok=True)
 
 
 def _read(name: str, path: Path, scale: float | None, unknown: float | None) -> Tensor:
@@ -239,17 +265,16 @@ def find_maps(manifest: Path, out: Path, ending: str) -> tuple[list[PairFiles], 
         name = f"{pair.dataset}/{pair.scene}"
         if pair.disparity_est is None:
             raise ValueError(f"manifest: {manifest} must name a disparity_est for every pair, {name} has none")
-        inputs = local_paths(*(getattr(pair, key) for key in PATHS))
-        read |= {path.resolve() for path in inputs}
-        result = out / f"{name}{ending}"
-        place = result.resolve()
+        source = map_source(pair, out, ending)
+        read |= {path.resolve() for path in source.inputs}
+        place = source.results[0].resolve()
         if not place.is_relative_to(out.resolve()):
             raise ValueError(f"manifest: {manifest} must have names of pairs that stay below out, got {name!r}")
         other = taken.setdefault(place, pair)
         if other is not pair:
             names = f"{other.dataset}/{other.scene} and {name}"
             raise ValueError(f"manifest: {manifest} names {names}, whose results would have one name")
-        sources.append(Source(name, inputs, (result,), pair_row(pair)))
+        sources.append(source)
     replaced = next((place for place in taken if place in read), None)
     if replaced is not None:
         raise ValueError(

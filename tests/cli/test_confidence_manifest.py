@@ -215,7 +215,63 @@ def test_workers_and_shards_give_what_one_call_gives(listed: Path, tmp_path: Pat
     assert (again.num_pairs, again.num_found, len(again.frame)) == (2, 2, 3)
 
 
-def die_at_c(job: confidence_folder._Job, tasks: Sequence[confidence_folder._Task]) -> ConfidenceSummary | Exception:
+def test_of_several_results_the_one_that_is_there_counts(listed: Path, tmp_path: Path) -> None:
+    """Maps of method A, then of method B, then of A again; files of one size."""
+    out, settings = tmp_path / "out", {"ending": ".npy", "stride": 4}
+    first = listed.read_text()
+    other = first.replace("map2.pfm", "map1.pfm")
+    a = confidence_folder.score_disparity_manifest(listed, out, **settings)
+    result = np.load(out / "two" / "d.npy")
+    for text, found in ((other, 2), (other, 3), (first, 2)):
+        listed.write_text(text)
+        again = confidence_folder.score_disparity_manifest(listed, out, **settings)
+        assert again.num_found == found
+    assert_frame_equal(again.frame, a.frame, abs_tol=1e-3)
+    np.testing.assert_allclose(np.load(out / "two" / "d.npy"), result, atol=1e-5)
+
+
+def test_calls_that_divide_the_work_in_two_ways_exclude_each_other(listed: Path, tmp_path: Path) -> None:
+    out, seen = tmp_path / "out", []
+
+    def meanwhile(shard: tuple[int, int]) -> str:
+        try:
+            confidence_folder.score_disparity_manifest(listed, out, stride=4, shard=shard)
+        except ValueError as error:
+            return str(error)
+        return "done"
+
+    def look(done: int, total: int, name: str) -> None:
+        if not seen:
+            seen.extend(meanwhile(shard) for shard in ((1, 1), (1, 3), (1, 2), (2, 2)))
+
+    confidence_folder.score_disparity_manifest(listed, out, stride=4, shard=(1, 2), on_progress=look)
+    assert ["another call works on" in text for text in seen] == [True, True, True, False]
+    assert seen[3] == "done"
+    assert len(pl.read_parquet(out / "confidence.parquet")) == 3  # of both
+
+
+def raise_key_error(job: object, task: object) -> ConfidenceSummary:
+    raise KeyError("a fault of the library")
+
+
+def score_with_a_fault(
+    job: confidence_folder._Job, tasks: Sequence[confidence_folder._Task]
+) -> ConfidenceSummary | confidence_folder._Failure:
+    confidence_folder._score = raise_key_error
+    return SCORE_IN_WORKER(job, tasks)
+
+
+def test_a_fault_of_the_library_is_raised_from_a_worker(
+    listed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(confidence_folder, "_score_in_worker", score_with_a_fault)
+    with pytest.raises(RuntimeError, match=r"a worker raised\n(?s:.*)KeyError: 'a fault of the library'"):
+        confidence_folder.score_disparity_manifest(listed, tmp_path / "out", stride=4, num_workers=2)
+
+
+def die_at_c(
+    job: confidence_folder._Job, tasks: Sequence[confidence_folder._Task]
+) -> ConfidenceSummary | confidence_folder._Failure:
     """A worker that is killed at one map."""
     if tasks[0].pair.scene == "deep/c":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -251,5 +307,15 @@ def test_what_is_kept_can_be_read_for_a_training(listed: Path, tmp_path: Path) -
         assert (item.probability - expected.nan_to_num(0)).abs().max() <= 0.5 / 65535 + 1e-5  # 16 bits; threads
     with pytest.raises(IndexError, match="there are 2 maps, got number 2"):
         data[2]
+    assert torch.equal(data[np.int64(1)].probability, items[1].probability)
+    (tmp_path / "map0.png").write_bytes((tmp_path / "map1.png").read_bytes())
+    with pytest.raises(ValueError, match="one/a b: its result is gone or of other files"):
+        data[0]
+    (out / "two" / "d.png").unlink()
+    with pytest.raises(ValueError, match="two/d: its result is gone"):
+        data[1]
+    (out / "confidence.json").write_text("{}")
+    with pytest.raises(ValueError, match="damaged: 'stride'"):
+        ConfidenceDataset(listed, out)
     with pytest.raises(FileNotFoundError, match="holds no results"):
         ConfidenceDataset(listed, tmp_path)

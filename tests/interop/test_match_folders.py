@@ -47,7 +47,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_every_file_has_its_result_and_failures_are_told(source: Path, tmp_path: Path) -> None:
     out, seen = tmp_path / "out", []
     summary = filter_files(source, out, config=SETTINGS, on_progress=lambda *state: seen.append(state))
-    assert set(contents(out)) == {*GOOD, "filter.json", "filter.jsonl"}
+    assert set(contents(out)) == {*GOOD, ".filter.lock", "filter.json", "filter.jsonl"}
     assert (summary.num_files, summary.num_found, list(summary.errors)) == (4, 0, ["damaged.npz"])
     assert "no readable archive" in summary.errors["damaged.npz"]
     assert [state[:2] for state in seen] == [(k + 1, 4) for k in range(4)]
@@ -203,14 +203,16 @@ def test_a_list_names_files_wherever_they_are(source: Path, tmp_path: Path, endi
     path = source / f"list{ending}"
     table.write_csv(path) if ending == ".csv" else table.write_parquet(path)
     summary = filter_files(path, tmp_path / "out", config=SETTINGS)
-    assert set(contents(tmp_path / "out")) == {*("deep [1]/seed=3/c.npz", "a.csv", "filter.json", "filter.jsonl")}
+    assert set(contents(tmp_path / "out")) == {
+        *("deep [1]/seed=3/c.npz", "a.csv", ".filter.lock", "filter.json", "filter.jsonl")
+    }
     assert list(summary.errors) == ["missing.npz"]
     names[1] = str(elsewhere)
     table = pl.DataFrame({"matches": names})
     table.write_csv(path) if ending == ".csv" else table.write_parquet(path)
     filter_files(path, tmp_path / "other", config=SETTINGS)
     assert set(contents(tmp_path / "other")) == {
-        *("matches/deep [1]/seed=3/c.npz", "elsewhere.csv", "filter.json", "filter.jsonl")
+        *("matches/deep [1]/seed=3/c.npz", "elsewhere.csv", ".filter.lock", "filter.json", "filter.jsonl")
     }
 
 
@@ -226,7 +228,7 @@ def test_hdf5_files_take_the_common_keypoints_where_they_have_none(tmp_path: Pat
     write_exported(folder / "exported.h5", {"pair": 0})
     summary = filter_files(folder, tmp_path / "out", keypoints=folder / "features.h5")
     assert (summary.num_files, summary.errors) == (2, {})
-    assert set(contents(tmp_path / "out")) == {"hloc.h5", "exported.h5", "filter.json", "filter.jsonl"}
+    assert set(contents(tmp_path / "out")) == {"hloc.h5", "exported.h5", ".filter.lock", "filter.json", "filter.jsonl"}
 
 
 def change_list(text: str) -> Callable[[Path], Path]:

@@ -85,6 +85,25 @@ def test_interval_is_that_of_resampled_pairs() -> None:
         np.testing.assert_allclose((low[column], high[column]), np.quantile(means, [0.025, 0.975]), atol=1e-12)
 
 
+def test_all_points_see_the_same_draws_of_the_pairs(runs: tuple[pl.DataFrame, pl.DataFrame]) -> None:
+    """Also those that lack a pair, as in a run that is not finished."""
+    a, b = runs
+    a = a.filter(~((pl.col("trial") == 3) & (pl.col("scene") == "Art")))
+    comparison = compare(a, b)
+    assert comparison.trials["num_pairs"].to_list() == [5 - (trial == 3) for trial in comparison.trials["trial"]]
+    scenes = sorted(set(b["scene"]))
+    values = np.full((len(scenes), len(comparison.trials)), math.nan)
+    for k, row in enumerate(comparison.trials.iter_rows(named=True)):
+        for p, scene in enumerate(scenes):
+            found = [
+                run.filter(trial=row[t], scene=scene)["auc"].to_list() for run, t in ((a, "trial"), (b, "trial_b"))
+            ]
+            if all(found):
+                values[p, k] = found[1][0] - found[0][0]
+    for end, expected in zip(("mean", "low", "high"), bootstrap_means(values), strict=True):
+        np.testing.assert_allclose(comparison.trials[f"auc_{end}"], expected, atol=1e-12)
+
+
 def test_interval_narrows_with_more_pairs_as_theory_says() -> None:
     values = np.random.default_rng(0).normal(0, 1, (400, 1))
     _, low, high = bootstrap_means(values)

@@ -74,9 +74,8 @@ def compare_runs(a: RunRows, b: RunRows) -> Comparison:
     there = values[0][1] & values[1][1]
     differences = np.where(there, values[1][0] - values[0][0], np.nan)
     compared = [k for k in range(len(both)) if there[:, k].any()]
-    trials = [
-        both[k][0] | {"trial_b": both[k][1]} | _summarise(differences[:, :, [k]], there[:, [k]]) for k in compared
-    ]
+    of_trials = _summarise(differences, there, [[k] for k in compared])
+    trials = [both[k][0] | {"trial_b": both[k][1]} | found for k, found in zip(compared, of_trials, strict=True)]
     of_detector = {
         name: [k for k in compared if both[k][0]["detector"] == name]
         for name in order_detectors({both[k][0]["detector"] for k in compared})
@@ -84,7 +83,7 @@ def compare_runs(a: RunRows, b: RunRows) -> Comparison:
     if len(of_detector) > 1:
         of_detector["all"] = compared
     detectors = [
-        {"detector": name} | _summarise(differences[:, :, of], there[:, of]) | {"num_settings": len(of)}
+        {"detector": name} | _summarise(differences, there, [of])[0] | {"num_settings": len(of)}
         for name, of in of_detector.items()
     ]
     only = [
@@ -200,18 +199,33 @@ def _metrics(rows: RunRows, pairs: pl.Series, trials: Sequence[int]) -> tuple[ND
     return values, there
 
 
-def _summarise(differences: NDArray[np.float64], there: NDArray[np.bool_]) -> dict[str, float]:
-    """Number of pairs, mean and interval of each metric: every pair's mean over its points, then over the pairs.
+def _summarise(
+    differences: NDArray[np.float64], there: NDArray[np.bool_], groups: Sequence[Sequence[int]]
+) -> list[dict[str, float]]:
+    """Number of pairs, mean and interval of each metric for some groups of points, which see the same draws of pairs.
 
     Args:
         differences: (M, P, T) of ``METRICS``.
         there: (P, T) whether both runs have the row.
+        groups: points; every pair's mean over those of a group counts once.
     """
-    some = there.any(1)
-    known = ~np.isnan(differences[:, some])
-    count = known.sum(2)
-    total = np.where(known, differences[:, some], 0).sum(2)
-    averaged = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
-    parts = dict(zip(ENDS, bootstrap_means(averaged.T), strict=True))
-    found = {f"{name}_{end}": float(parts[end][k]) for k, name in enumerate(METRICS) for end in ENDS}
-    return {"num_pairs": int(some.sum())} | found
+    some = there[:, [k for of in groups for k in of]].any(1)
+    if not groups:
+        return []
+    averaged = np.stack([_mean(differences[:, some][:, :, of]) for of in groups])  # (G, M, P)
+    ends = bootstrap_means(averaged.reshape(-1, averaged.shape[2]).T)
+    parts = [values.reshape(averaged.shape[:2]) for values in ends]
+    return [
+        {"num_pairs": int(there[:, of].any(1).sum())}
+        | {f"{name}_{end}": float(parts[e][g, m]) for m, name in enumerate(METRICS) for e, end in enumerate(ENDS)}
+        for g, of in enumerate(groups)
+    ]
+
+
+def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Over the known ones of the last axis; NaN without any."""
+    known = ~np.isnan(values)
+    count = known.sum(-1)
+    mean = np.full(count.shape, np.nan)
+    np.divide(np.where(known, values, 0).sum(-1), count, out=mean, where=count > 0)
+    return mean

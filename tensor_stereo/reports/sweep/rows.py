@@ -21,7 +21,7 @@ SCORE_RATES = ("auc", "specificity_at_sensitivity_96")
 COUNTS = ("score_counts_correct", "score_counts_incorrect")
 TIMES = (*STAGES, "total")
 # Added up as whole numbers, sums are the same in any order of the rows.
-RATE_UNIT = 2.0**-40
+RATE_UNIT = 2.0**-32  # of two billion rows 64 bits hold the sum
 SECONDS_UNIT = 1e-9
 _BATCH = 1 << 14
 _UNIT_COLUMNS = ("unit", "trial")

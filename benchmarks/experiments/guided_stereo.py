@@ -78,7 +78,6 @@ def vary(found: dict[str, Anchors]) -> dict[str, Anchors]:
     return {NO_HINTS: nothing} | found | equal | curve
 
 
-@torch.no_grad()
 def judge(work: Path, cases: list[Case], seed: int) -> list[dict[str, tuple[float, float]]]:
     """Share of bad pixels and mean error of every condition, for each case."""
     torch.set_num_threads(1)
@@ -89,8 +88,9 @@ def judge(work: Path, cases: list[Case], seed: int) -> list[dict[str, tuple[floa
         known = truth.isfinite() & (truth > 0)
         views = (torch.from_numpy(pair.left)[None], torch.from_numpy(pair.right)[None])
         figures = {}
-        for name, anchors in hints.items():
-            error = (net.predict(*views, anchors.hints(truth.shape)) - truth).abs()[known]
+        maps = net.predict(*views, (anchors.hints(truth.shape) for anchors in hints.values()))
+        for name, disparity in zip(hints, maps, strict=True):
+            error = (disparity - truth).abs()[known]
             figures[name] = float((error > BAD_PX[group]).float().mean()), float(error.mean())
         found.append(figures)
     return found

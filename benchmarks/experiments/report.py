@@ -17,7 +17,7 @@ from shared.results import RESULTS, read_records
 GROUPS = {"eight": "the eight scenes, bad-2px", "kitti": "KITTI, drive 0015, bad-3px"}
 ABOUT = """# What filtered matches are worth in learning-based stereo
 
-Five networks of 400 000 weights, from five seeds (`experiments/train_guided.py`); figures are their means over the
+Five networks of 392 000 weights, from five seeds (`experiments/train_guided.py`); figures are their means over the
 scenes, +- the standard deviation over the networks. *Power*: mean over spread of the difference between no filter and
 the oracle; the experiment tells filters apart where it is above 3. *Closed*: part of the gap between the left-right
 check and the oracle. Written by `experiments/report.py`.

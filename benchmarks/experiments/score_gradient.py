@@ -42,7 +42,7 @@ PUTATIVES = PipelineConfig(
 )
 SEEDS = range(5)
 NOISE_PX = (0.3, 1.0)  # standard deviation in x and y of the start
-WEIGHTS = (0.03, 0.1, 0.3, 1.0)
+WEIGHTS = (0.1, 0.3, 1.0)
 SCORES = ("topology", "consensus", "learned", "learned, all tolerances")
 WINDOWS = "windows"
 _TOLERANCE_PX = 1.0
@@ -178,7 +178,7 @@ def to_pair(pair: GrayPair) -> StereoPair:
 def main() -> None:
     suite = Suite("score_gradient")
     groups = load_pairs(suite.options.data)
-    training = [to_pair(pair) for pair in groups["training"]][::3]
+    training = [to_pair(pair) for pair in groups["training"]][::4]
     eight = [to_pair(pair) for pair in groups["eight"]]
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         for noise_px in NOISE_PX:

@@ -31,7 +31,7 @@ CONDITIONS = (
     "learned + repair",
     "oracle",
 )
-LIKELY, TOLERANCE_PX = 0.5, 1.0
+LIKELY = 0.5
 
 
 class Anchors(NamedTuple):
@@ -40,15 +40,19 @@ class Anchors(NamedTuple):
     Attributes:
         pixels: (N, 2) x and y.
         disparity: (N,) px.
-        correct: (N,) bool, off by at most 1 px; True where the truth is unknown.
+        error_px: (N,) of the match, NaN where the truth is unknown.
     """
 
     pixels: NDArray[np.int64]
     disparity: NDArray[np.float64]
-    correct: NDArray[np.bool_]
+    error_px: NDArray[np.float64]
 
     def some(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Anchors:
-        return Anchors(self.pixels[rows], self.disparity[rows], self.correct[rows])
+        return Anchors(self.pixels[rows], self.disparity[rows], self.error_px[rows])
+
+    def wrong(self, tolerance_px: float) -> NDArray[np.bool_]:
+        """(N,) known to be off by more."""
+        return self.error_px > tolerance_px
 
     def hints(self, shape: Sequence[int]) -> torch.Tensor:
         """(H, W) float32 px, NaN where there is none."""
@@ -59,11 +63,13 @@ class Anchors(NamedTuple):
 
 
 @torch.no_grad()
-def find_anchors(pair: GrayPair, network: LearnedScore, *, gated: bool) -> dict[str, Anchors]:
+def find_anchors(
+    pair: GrayPair, network: LearnedScore, *, gated: bool, tolerance_px: float = 1.0
+) -> dict[str, Anchors]:
     """FAST corners matched by SSD, and what each condition keeps of them; GMS where OpenCV has it.
 
     Thresholds are those that ``accuracy/dense.py`` chose on the training scenes; a calibrated probability is taken at
-    its word, .5.
+    its word, .5. The oracle keeps what is known to be right within ``tolerance_px``.
     """
     given = find_putatives(pair, "fast", gated=gated)
     scores = score_filters(pair, given, network)
@@ -74,13 +80,11 @@ def find_anchors(pair: GrayPair, network: LearnedScore, *, gated: bool) -> dict[
         MEDIAN: scores[MEDIAN] >= median_threshold(gated=gated),
         "consensus": scores["consensus"] >= LIKELY,
         "learned": scores["learned"] >= LIKELY,
-        "oracle": given.correct & given.valid,
+        "oracle": given.error_px <= tolerance_px,
     }
     if hasattr(cv2, "xfeatures2d"):  # of opencv-contrib
         kept["GMS"] = score_gms(given) > 0
-    every = Anchors(
-        np.rint(given.points0).astype(np.int64), (given.points0 - given.points1)[:, 0], given.correct | ~given.valid
-    )
+    every = Anchors(np.rint(given.points0).astype(np.int64), (given.points0 - given.points1)[:, 0], given.error_px)
     found = {name: every.some(rows) for name, rows in kept.items()}
     found["learned + repair"] = repaired(pair, given, network)
     return {name: found[name] for name in CONDITIONS if name in found}
@@ -96,7 +100,7 @@ def repaired(pair: GrayPair, given: Putatives, network: LearnedScore) -> Anchors
     rows = ((anew.score >= LIKELY) & (anew.graphs.group_size > 0)).numpy()
     error = errors_against_gt(more.matches, torch.from_numpy(pair.disparity_gt)[None]).numpy()
     points0, points1 = (points.double().numpy() for points in (more.matches.keypoints0, more.matches.keypoints1))
-    every = Anchors(np.rint(points0).astype(np.int64), (points0 - points1)[:, 0], ~(error > TOLERANCE_PX))
+    every = Anchors(np.rint(points0).astype(np.int64), (points0 - points1)[:, 0], error)
     return every.some(rows)
 
 

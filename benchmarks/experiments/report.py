@@ -10,10 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packages
 from shared.figures import plt, save_figure
 from shared.results import RESULTS, read_records
 
+NO_HINTS = "no guidance"
 GROUPS = {"eight": "the eight scenes, bad-2px", "kitti": "KITTI, drive 0015, bad-3px"}
 ABOUT = """# What filtered matches are worth in learning-based stereo
 
@@ -97,24 +100,28 @@ def notes(records: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 
 def draw(records: Sequence[dict[str, Any]]) -> None:
-    """Bad pixels by condition, and over the share of wrong hints."""
+    """What each condition changes against no hints, by network, and bad pixels over the share of wrong hints."""
     rows = [row for row in records if "condition" in row]
     kinds = list(dict.fromkeys((row["putatives"], row["group"]) for row in rows))
-    figure, axes = plt.subplots(2, len(kinds), figsize=(4 * len(kinds), 7), layout="constrained", squeeze=False)
-    for (top, bottom), kind in zip(axes.T, kinds, strict=True):
+    figure, axes = plt.subplots(2, len(kinds), figsize=(15, 7), layout="constrained", squeeze=False)
+    for k, ((top, bottom), kind) in enumerate(zip(axes.T, kinds, strict=True)):
         of = {r["condition"]: r for r in rows if (r["putatives"], r["group"]) == kind}
+        without = np.array(of.pop(NO_HINTS)["networks_bad"])
         plain = {name: row for name, row in of.items() if not name.endswith(("equal", "wrong"))}
-        bad, spread = ([100 * row[key] for row in plain.values()] for key in ("bad", "bad_spread"))
-        top.barh(list(plain), bad, xerr=spread)
+        change = 100 * (np.array([row["networks_bad"] for row in plain.values()]) - without)
+        colors = ["tab:orange" if name.startswith("learned") else "tab:blue" for name in plain]
+        names = list(plain) if k == 0 else [""] * len(plain)
+        top.barh(range(len(plain)), change.mean(1), xerr=change.std(1, ddof=1), color=colors)
+        top.set_yticks(range(len(plain)), names)
+        top.axvline(0, color="black", linewidth=0.8)
         top.invert_yaxis()
-        top.set(title=f"{kind[0]}\n{GROUPS[kind[1]]}", xlabel="bad pixels, %")
+        top.set(title=f"{kind[0]}\n{GROUPS[kind[1]]}", xlabel="bad pixels against no hints, %")
         curve = [(float(name.split("%")[0]), 100 * row["bad"]) for name, row in of.items() if name.endswith("wrong")]
         bottom.plot(*zip(*curve, strict=True), marker="o")
-        without = 100 * of["no guidance"]["bad"]
-        bottom.axhline(without, color="gray", linestyle="dashed")
-        bottom.annotate("no guidance", (0, without), color="gray", va="bottom")
-        bottom.set(xlabel="wrong hints, %", ylabel="bad pixels, %")
-    save_figure(figure, "guided_stereo", 80)
+        bottom.axhline(100 * without.mean(), color="gray", linestyle="dashed")
+        bottom.annotate("no hints", (40, 100 * without.mean()), color="gray", va="top", ha="right")
+        bottom.set(xlabel="wrong hints, %", ylabel="bad pixels, %" if k == 0 else "")
+    save_figure(figure, "guided_stereo", 75)
 
 
 def main() -> None:

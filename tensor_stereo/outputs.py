@@ -42,9 +42,9 @@ class FilterOutput:
             rectified pairs, map and epipolar lines of others, and whether enough matches agree on them; None where the
             score takes none out.
         cumulative: One axis more: probabilities of an error of at most each of
-            :data:`tensor_stereo.scores.TOLERANCES_PX`, 0 where the score is; None where that is no probability. One minus
-            their mean is the loss that helps keypoints most which are off by a pixel; for finer noise it is one minus
-            the score (measured, see docs/training.md).
+            :data:`tensor_stereo.scores.TOLERANCES_PX`, 0 where the score is; None where that is no probability. As a
+            loss, one minus their mean helps keypoints that are off by a pixel most, one minus the score those that are
+            nearly right (measured, see docs/training.md).
         domain: (B,) int8, values of :class:`tensor_stereo.scores.Domain`: why a pair lies outside of what the
             probability was calibrated on, 0 inside; None where there is no probability.
         rows: (M,) int64, of repaired matches: the rows of those that were given, -1 for keypoints that had no partner;

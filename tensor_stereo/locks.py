@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, Any
 
 _WAIT_SECONDS = 0.05
@@ -36,6 +39,22 @@ def lock(file: IO[Any], *, wait: bool = False) -> bool:
             time.sleep(_WAIT_SECONDS)
         else:
             return True
+
+
+@contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Wait for the lock on a file, which is made, and hold it for as long as the block runs."""
+    with path.open("w") as file:
+        lock(file, wait=True)
+        yield
+
+
+def is_held(path: Path) -> bool:
+    """Whether another process holds the lock on a file; False of one that does not exist."""
+    if not path.exists():
+        return False
+    with path.open("r+") as file:
+        return not lock(file)
 
 
 if sys.platform == "win32":

@@ -5,13 +5,13 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Generic, NamedTuple, TypeVar
 
 from tensor_stereo.atomic import append_line, drop_torn_line, whole_file
-from tensor_stereo.locks import lock
+from tensor_stereo.locks import hold, is_held, lock
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 ONE_SOURCE_FAILS = (ValueError, TypeError, ImportError, OSError, RuntimeError, MemoryError)
@@ -222,19 +222,16 @@ class ResultFolder(Generic[Summary]):
         except (ValueError, TypeError, KeyError):
             return None
 
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Wait for, and hold, the folder for the moment of a change that all shards share."""
-        with (self.out / f".{self.kind}.lock").open("w") as file:
-            lock(file, wait=True)
-            yield
+    def _locked(self) -> AbstractContextManager[None]:
+        """Hold the folder for the moment of a change that all shards share."""
+        return hold(self.out / f".{self.kind}.lock")
 
     @contextmanager
     def _claim(self) -> Iterator[IO[bytes]]:
         """The journal of this shard, locked; raise if another call has it, or divides the work in another way."""
         with self.journal_file.open("ab", buffering=0) as journal:
             with self._locked():
-                if not lock(journal) or any(_is_held(path) for path in self._other_divisions()):
+                if not lock(journal) or any(map(is_held, self._other_divisions())):
                     raise ValueError(f"out: another call works on {self.out}; wait for it or name another folder")
                 self._claim_settings()
             yield journal
@@ -294,12 +291,6 @@ def find_entry(source: Source, entries: dict[str, list[dict[str, Any]]]) -> dict
 def _journals(out: Path, kind: str) -> list[Path]:
     whole = out / f"{kind}.jsonl"
     return sorted(out.glob(f"{kind}-*-of-*.jsonl")) + [whole] * whole.exists()
-
-
-def _is_held(path: Path) -> bool:
-    """Whether another process works on a shard."""
-    with path.open("r+") as file:
-        return not lock(file)
 
 
 def _state(paths: Sequence[Path]) -> dict[str, Any]:

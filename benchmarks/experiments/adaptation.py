@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks/, for its packa
 from accuracy.confidence import load_ccnn, load_network, score_maps
 from accuracy.putatives import load_pairs
 from experiments.guided_network import GuidedStereoNet
-from experiments.guided_stereo import BAD_PX
+from experiments.guided_stereo import BAD_PX, TOLERANCE_PX, note_gap
 from experiments.train_guided import SEEDS, VALIDATION_FOLD, load_guided
 from shared.harness import Suite
 from training.dense_maps import CLASSIC, both_maps
@@ -48,7 +48,6 @@ CONDITIONS = (
 )
 BEFORE = "no adaptation"
 STEPS, CROPS_AT_ONCE, CROP, LEARNING_RATE = 40, 2, (192, 384), 3e-4
-TOLERANCE_PX = {"eight": 1.0, "kitti": 3.0}
 AIM = 0.95  # min_precision
 
 
@@ -190,12 +189,7 @@ def report(suite: Suite, group: str, domains: list[Domain], judged: list[list[di
         suite.records.append(record)
         keys = ("bad", "bad_spread", "epe_px", "epe_spread_px", "share", "correct")
         print(f"  {name:24}" + "  ".join(f"{key} {record[key]:.4f}" for key in keys if key in record), flush=True)
-    gap = bad["all pixels"] - bad["oracle"]
-    closed = {
-        name: float((bad["left-right check"] - bad[name]).mean() / (bad["left-right check"] - bad["oracle"]).mean())
-        for name in CONDITIONS[2:6]
-    }
-    suite.note(f"{group}: gap closed", power=float(gap.mean() / gap.std(ddof=1)), **closed)
+    note_gap(suite, group, bad, "all pixels", CONDITIONS[2:6])
 
 
 def main() -> None:

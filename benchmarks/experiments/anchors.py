@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-import tensor_stereo as ts
 from accuracy.dense import score_filters
 from accuracy.peers import score_gms
 from accuracy.putatives import GrayPair, Putatives, find_putatives, to_matches
@@ -129,8 +128,3 @@ def median_threshold(*, gated: bool) -> float:
         for record in read_records("dense")
         if record.get("putatives") == kind and record.get("filter") == MEDIAN
     )
-
-
-def load_network(folds: Sequence[LearnedScore], fold: int | None) -> LearnedScore:
-    """The learned score as it is shipped, or the one that was trained without a fold."""
-    return ts.scores.load_learned() if fold is None else folds[fold]

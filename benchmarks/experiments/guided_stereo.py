@@ -14,7 +14,7 @@ import multiprocessing
 import os
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -102,10 +102,16 @@ def judge(work: Path, cases: list[Case], seed: int) -> list[dict[str, tuple[floa
     return found
 
 
-def share_of_gap(bad: dict[str, NDArray[np.float64]], name: str) -> float:
-    """What part of the gap between left-right check and oracle a condition closes."""
-    check, oracle, own = (bad[key].mean() for key in ("left-right check", "oracle", name))
-    return float((check - own) / (check - oracle))
+def note_gap(suite: Suite, title: str, bad: dict[str, NDArray[np.float64]], every: str, names: Sequence[str]) -> None:
+    """What part of the gap between left-right check and oracle some conditions close, and whether that can be told.
+
+    The power is the mean over the networks of the difference between ``every``, without a filter, and the oracle, over
+    its spread.
+    """
+    check, oracle = (bad[key].mean() for key in ("left-right check", "oracle"))
+    gap = bad[every] - bad["oracle"]
+    closed = {name: float((check - bad[name].mean()) / (check - oracle)) for name in names}
+    suite.note(f"{title}: gap closed", power=float(gap.mean() / gap.std(ddof=1)), **closed)
 
 
 def report(suite: Suite, putatives: str, group: str, cases: list[Case], judged: list[list[dict]]) -> None:
@@ -131,10 +137,8 @@ def report(suite: Suite, putatives: str, group: str, cases: list[Case], judged: 
         print(f"  {name:40} {record['hints']:7.0f}  {text}", flush=True)
     for ending in ("", ", equal"):
         of = {name: bad[name + ending] for name in CONDITIONS if name in bad}
-        gap = of["all putatives"] - of["oracle"]
-        power = float(gap.mean() / gap.std(ddof=1))
-        closed = {name: share_of_gap(of, name) for name in ("learned", "learned + repair", "consensus")}
-        suite.note(f"{group}, {putatives}{ending}: gap closed", power=power, **closed)
+        ours = ("learned", "learned + repair", "consensus")
+        note_gap(suite, f"{group}, {putatives}{ending}", of, "all putatives", ours)
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tensor_stereo.atomic import append_line, drop_torn_line
-from tensor_stereo.locks import lock
+from tensor_stereo.locks import hold, is_held, lock
 
 LOG = logging.getLogger(__name__)
 
@@ -155,12 +155,9 @@ def append(entry: dict[str, Any], journal: IO[bytes]) -> None:
     append_line(json.dumps(entry, separators=(",", ":")).encode(), journal)
 
 
-@contextmanager
-def run_lock(out: Path) -> Iterator[None]:
-    """Wait for, and hold, the run folder for the moment of a change that all shards share."""
-    with (out / ".lock").open("w") as file:
-        lock(file, wait=True)
-        yield
+def run_lock(out: Path) -> AbstractContextManager[None]:
+    """Hold the run folder for the moment of a change that all shards share."""
+    return hold(out / ".lock")
 
 
 def open_journal(out: Path, shard: tuple[int, int]) -> IO[bytes]:
@@ -187,11 +184,7 @@ def _lock_journal(file: IO[Any], path: Path) -> None:
 
 def is_open_elsewhere(out: Path, shard: str) -> bool:
     """Whether another process works on a shard, named as in ``journal-1-of-4``."""
-    path = out / f"journal-{shard}.jsonl"
-    if not path.exists():
-        return False
-    with path.open("r+") as file:
-        return not lock(file)
+    return is_held(out / f"journal-{shard}.jsonl")
 
 
 def _is_whole(path: Path, size: int, sha256: str, verify: bool) -> bool:

@@ -13,6 +13,7 @@ import torch
 from tensor_stereo.evaluation.metrics import PAPER_SENSITIVITY, Confusion, ScoreCounts
 from tensor_stereo.evaluation.rows import SCORE_BINS
 from tensor_stereo.reports.sweep.rows import (
+    BALANCED,
     CELLS,
     COUNTS,
     RATE_UNIT,
@@ -24,8 +25,6 @@ from tensor_stereo.reports.sweep.rows import (
     RunRows,
 )
 from tensor_stereo.reports.sweep.settings import PERTURBATIONS, SETTINGS, order_detectors
-
-_BALANCED = (pl.col("sensitivity") + pl.col("specificity")) / 2
 
 
 def decided_by_score(row: Mapping[str, Any]) -> bool:
@@ -135,7 +134,7 @@ def best_trials(trials: pl.DataFrame) -> pl.DataFrame:
 
     Of those with the mildest perturbation, pairs pooled. Columns as of :func:`pool_trials`.
     """
-    pooled = pool_trials(mildest(trials)).with_columns(balanced_accuracy=_BALANCED)
+    pooled = pool_trials(mildest(trials)).with_columns(balanced_accuracy=BALANCED)
     known = pooled.filter(pl.col("balanced_accuracy").is_not_nan())
     # of equal ones rather one with a score, which tells more
     best = known.sort("balanced_accuracy", pl.col("auc").is_not_null(), "trial", descending=[True, True, False])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import polars as pl
 
+from tensor_stereo.reports.sweep.pooling import worst_pairs
 from tensor_stereo.reports.sweep.rows import RunRows
 
 ERROR_COLUMNS = ("unit", "dataset", "scene", "detector", "stage", "error", "message", "attempts")
@@ -55,6 +57,11 @@ class RunResults:
     config: dict[str, Any]
     environment: list[dict[str, Any]]
     overlays: tuple[Overlay, ...] = ()
+
+    @cached_property
+    def worst(self) -> pl.DataFrame:
+        """The :func:`~tensor_stereo.reports.sweep.pooling.worst_pairs` that page and Markdown list."""
+        return worst_pairs(self.rows)
 
     def __post_init__(self) -> None:
         missing = [name for name in ERROR_COLUMNS if name not in self.errors.columns]

@@ -23,6 +23,7 @@ TIMES = (*STAGES, "total")
 # Added up as whole numbers, sums are the same in any order of the rows.
 RATE_UNIT = 2.0**-32  # of two billion rows 64 bits hold the sum
 SECONDS_UNIT = 1e-9
+BALANCED = (pl.col("sensitivity") + pl.col("specificity")) / 2
 _BATCH = 1 << 14
 _UNIT_COLUMNS = ("unit", "trial")
 
@@ -69,22 +70,17 @@ class RunRows:
         units = lazy.select(
             *_UNIT_COLUMNS,
             pair_key().alias("pair"),
-            ((pl.col("sensitivity") + pl.col("specificity")) / 2).alias("balanced_accuracy"),
+            BALANCED.alias("balanced_accuracy"),
             (pl.col("domain") != "").fill_null(value=False).alias("is_outside"),
         ).collect()
         _check_unique(units)
         pairs = units.group_by("trial").agg(pl.col("pair").n_unique().alias("num_pairs"))
         sums = lazy.group_by("trial").agg(_sums()).collect(engine="streaming")
-        trials = settings.join(sums, on="trial").join(pairs, on="trial").join(_scores(lazy, len(units)), on="trial")
+        trials = settings.join(sums, on="trial").join(pairs, on="trial").join(_scores(lazy, sums), on="trial")
         return cls(lazy, trials.sort("trial"), units)
 
     def __len__(self) -> int:
         return len(self.units)
-
-    @property
-    def num_pairs(self) -> int:
-        """How many pairs have rows."""
-        return self.units["pair"].n_unique()
 
     def find(self, keys: pl.DataFrame) -> pl.DataFrame:
         """Whole rows without the counts of scores, by ``unit`` and ``trial``, in the order of ``keys``.
@@ -134,9 +130,10 @@ def _sums() -> Iterable[pl.Expr]:
         yield value.count().alias(f"num_{name}")
 
 
-def _scores(lazy: pl.LazyFrame, num_rows: int) -> pl.DataFrame:
-    """The sums of ``COUNTS`` per trial, null where a row has none."""
-    trials: list[int] = lazy.select("trial").unique().collect()["trial"].sort().to_list()
+def _scores(lazy: pl.LazyFrame, totals: pl.DataFrame) -> pl.DataFrame:
+    """The sums of ``COUNTS`` per trial of ``totals``, null where a row has none."""
+    trials: list[int] = totals["trial"].sort().to_list()
+    num_rows = int(totals["num_rows"].sum())
     sums = torch.zeros(2, len(trials), SCORE_BINS, dtype=torch.int64)
     unscored = np.zeros(len(trials), bool)
     num_seen = 0

@@ -10,7 +10,7 @@ import polars as pl
 
 from tensor_stereo.reports.sweep.compare import METRICS, Comparison
 from tensor_stereo.reports.sweep.drawing import run_prefix
-from tensor_stereo.reports.sweep.pooling import best_trials, stage_times, worst_pairs
+from tensor_stereo.reports.sweep.pooling import best_trials, stage_times
 from tensor_stereo.reports.sweep.results import RunResults
 from tensor_stereo.reports.sweep.rows import SCORE_RATES, VERDICT_RATES
 from tensor_stereo.reports.sweep.settings import (
@@ -139,7 +139,7 @@ def worst_table(run: RunResults) -> Table:
             row["num_valid"],
             *(row[name] for name in rates),
         )
-        for row in worst_pairs(run.rows).iter_rows(named=True)
+        for row in run.worst.iter_rows(named=True)
     )
     return Table(f"{run.name}: pairs on which even the best trial does badly", columns, rows, decimals=3)
 
